@@ -1,4 +1,5 @@
-//! Reports that count: the freshest of each vehicle, their age, and the offset of its clock.
+//! Admission of reports: selects the freshest report of each vehicle, and determines its age and
+//! the offset of the vehicle's clock.
 
 pub mod live_stream;
 pub mod minimum_delay;

@@ -1,14 +1,15 @@
 //! The aggregator of a cell, without sockets and clocks: reports go in, maps and verdicts come out.
 //!
 //! Call [`Aggregator::report`] with every decoded report and [`Aggregator::tick`] at the latest at
-//! [`Aggregator::deadline`]. Either may close a round and return it. A live node and the replay of a log run this same
-//! machine.
+//! [`Aggregator::deadline`]. Either may close a round and return it. A live node and the replay of
+//! a log run this same machine.
 //!
-//! A round closes for PACE and VOTE together: its map and verdicts have the same epoch, number and time. Where both run,
-//! the first vote starts verdicts. In VOTE's `paper` mode only rounds that complete a packet of frames have verdicts.
+//! A round closes for PACE and VOTE together: its map and verdicts have the same epoch, number and
+//! time. Where both run, the first vote starts verdicts. In VOTE's `paper` mode only rounds that
+//! complete a packet of frames have verdicts.
 //!
-//! A standby takes reports and closes rounds, but returns nothing. After [`Aggregator::lead`] it returns its rounds,
-//! which rest on all evidence that it has gathered.
+//! A standby processes reports and closes rounds without returning them. After [`Aggregator::lead`]
+//! it returns its rounds, which use all evidence that it has gathered.
 
 pub mod round;
 
@@ -62,23 +63,26 @@ pub struct Fused {
     pub round: u64,
     /// The map, if the cell runs PACE.
     pub map: Option<GlobalMap>,
-    /// The verdicts, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
+    /// The verdicts, if the cell runs VOTE; in `paper` mode only when a packet of frames is
+    /// complete.
     pub verdicts: Option<Verdicts>,
-    /// Votes and statements about tracked objects that are now known to be right or wrong.
+    /// Votes and statements about tracked objects that have turned out to be right or wrong.
     pub evidence: Vec<Evidence>,
-    /// The reputations, with the verdicts of VOTE's `paper` mode: they do not follow from the evidence there.
+    /// The reputations, together with the verdicts of VOTE's `paper` mode, where they do not follow
+    /// from the evidence.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
-    /// Entries that were left out of map and verdicts: those that receivers would refuse, such as an object that prediction
-    /// takes beyond the bounds of the wire format, and those beyond the share of one vehicle.
+    /// Entries that were left out of map and verdicts: entries that receivers would refuse, such as
+    /// an object that prediction moves beyond the bounds of the wire format, and entries beyond the
+    /// share of one vehicle.
     pub left_out: Vec<InvalidEntry>,
 }
 
-/// Numbers of reports of detections that a cell with known locations used.
+/// Counts of the detection reports that were used in a cell with landmarks.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Placements {
     /// With an object at a location or, where objects are tracked, near one.
     pub placed: u64,
-    /// With objects, and none of them there.
+    /// Reports with objects that are all away from the landmarks.
     pub misplaced: u64,
 }
 
@@ -87,15 +91,16 @@ pub struct Placements {
 pub struct Aggregator {
     leads: Option<Epoch>,
     next_round: u64,
-    /// The cell's time less the time of the caller in microseconds.
+    /// The cell's time minus the time of the caller in microseconds.
     cell_offset_us: i64,
     windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
     pace: Option<Pace>,
     tracks: Option<Tracker>,
-    /// True if tracking ends when the first location becomes known.
+    /// True if tracking ends when the first landmark is added.
     tracks_open_cell: bool,
-    /// Reports that only tracking used, because a later one of their vehicle came before.
+    /// Number of reports that only tracking used, because a later report of their vehicle arrived
+    /// first.
     overtaken: u64,
     placements: Placements,
     neighbours: NeighbourView,
@@ -104,7 +109,8 @@ pub struct Aggregator {
     initial_votes: f64,
     vote: Option<Vote>,
     by_packets: bool,
-    /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
+    /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty
+    /// verdicts.
     voted: bool,
 }
 
@@ -151,7 +157,8 @@ impl Aggregator {
         }
     }
 
-    /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
+    /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as
+    /// valid.
     pub fn new(
         name: NodeName,
         epoch: u64,
@@ -164,8 +171,9 @@ impl Aggregator {
         aggregator
     }
 
-    /// Goes on under other settings, taken as valid. Reports, votes, tracks and trust stay as far as they still apply: known
-    /// locations are told apart by their ids. An algorithm, or a mode of one, that was not used before starts anew.
+    /// Applies new settings, which must be valid. Reports, votes, tracks and trust are kept as far
+    /// as they still apply; landmarks are matched by their ids. An algorithm or mode that was not
+    /// used before starts empty.
     pub fn configure(&mut self, config: FusionConfig, landmarks: Vec<Landmark>) {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
         let FusionConfig {
@@ -200,8 +208,9 @@ impl Aggregator {
         });
     }
 
-    /// Leads from `now` on: the next round is number `first_round` of `epoch` and due as `first` says. Only later reports
-    /// yield evidence: earlier ones may have counted in another lane, and no vote counts twice.
+    /// Starts leading at `now`: the next round has number `first_round` of `epoch`, and `first`
+    /// defines when it is due. Only later reports yield evidence, because earlier reports may have
+    /// counted in another lane and every vote must count once.
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         if self.leads.replace(epoch).is_none() {
             self.vote.iter_mut().for_each(|vote| vote.begin_record(now));
@@ -209,7 +218,7 @@ impl Aggregator {
                 .iter_mut()
                 .for_each(|tracks| tracks.begin_record(now));
         }
-        // Rounds that were closed meanwhile count.
+        // Rounds that were closed in the meantime count.
         let min_round = if first == FirstRound::InStep {
             self.next_round
         } else {
@@ -219,12 +228,12 @@ impl Aggregator {
         self.rounds.start(first, now);
     }
 
-    /// Lets the present round last its whole length, as time for another node to take over the lead.
+    /// Lets the current round last its full length, to give another node time to take over.
     pub fn hold(&mut self) {
         self.rounds.hold();
     }
 
-    /// Gives up the lead and continues as a standby.
+    /// Stops leading and continues as a standby.
     pub fn step_down(&mut self) {
         self.leads = None;
     }
@@ -234,11 +243,12 @@ impl Aggregator {
         self.leads.as_ref()
     }
 
-    /// Takes a report received at `now`; returns the round if the report closes it. Only tracking uses a report that a
-    /// later one of its vehicle overtook.
+    /// Processes a report received at `now`; returns the round if the report closes it. A report
+    /// that was overtaken by a later report of its vehicle is used by tracking only.
     ///
     /// # Errors
-    /// The reason why the report was not used; at most the estimate of its vehicle's clock has changed.
+    /// Returns the reason why the report was not used. In this case only the estimate of its
+    /// vehicle's clock may have changed.
     pub fn report(
         &mut self,
         kind: ReportKind,
@@ -316,7 +326,7 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
-    /// Time for which reports of a vehicle or part have been rejected for their time, and nothing else.
+    /// Time for which reports of a vehicle or part have been rejected because of their time only.
     pub fn untimely_for(&self, kind: ReportKind, name: &NodeName, now: Timestamp) -> Duration {
         self.windows[kind as usize].untimely_for(name, now)
     }
@@ -343,7 +353,7 @@ impl Aggregator {
         self.placements
     }
 
-    /// True if a location of this id is known; `None` if none is known at all.
+    /// True if there is a landmark with this id; `None` if there are no landmarks at all.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
         let Some(pace) = &self.pace else {
             return self.vote.as_ref()?.knows_location(id);
@@ -352,8 +362,8 @@ impl Aggregator {
         (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
     }
 
-    /// Adds known locations for PACE; evidence stays, but tracking in mode `auto` ends. VOTE takes locations from reports
-    /// itself where none are known.
+    /// Adds landmarks for PACE. Evidence is kept, but tracking in mode `auto` ends. In a cell
+    /// without landmarks, VOTE takes the locations from the reports.
     pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
         if self.tracks_open_cell && !landmarks.is_empty() {
             self.tracks = None;
@@ -363,16 +373,16 @@ impl Aggregator {
         }
     }
 
-    /// Judges VOTE's stored votes `passes` times and returns the verdicts as a round of their own; see [`Vote::refine`].
-    /// `None` without VOTE or leadership.
+    /// Re-evaluates VOTE's stored votes `passes` times and returns the verdicts as a separate
+    /// round; see [`Vote::refine`]. `None` without VOTE or leadership.
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let verdicts = self.vote.as_mut()?.refine(passes);
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// Judges the incomplete packet of VOTE's `paper` mode in a round of its own, at the end of a recording. `None` if no
-    /// packet was begun, or without leadership.
+    /// Evaluates the incomplete packet of VOTE's `paper` mode in a separate round, at the end of a
+    /// recording. `None` if no packet was begun, or without leadership.
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;
@@ -400,8 +410,8 @@ impl Aggregator {
         round
     }
 
-    /// The share of the vehicles heard lately whose reports are usable by their time. A vehicle that sends reports of both
-    /// kinds counts once.
+    /// The share of the recently active vehicles whose reports are usable by their time. A vehicle
+    /// that sends reports of both kinds counts once.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         let [detections, votes] = self.windows.each_ref().map(|window| window.timeliness(now));
         Timeliness {
@@ -410,7 +420,7 @@ impl Aggregator {
         }
     }
 
-    /// VOTE's trust in each vehicle, from the evidence of this aggregator.
+    /// VOTE's reputation of each vehicle, from the evidence of this aggregator.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.vote
             .as_ref()
@@ -437,9 +447,9 @@ impl Aggregator {
         }
     }
 
-    /// Takes all objects of other cells near this one, of the age that they state at `stated_at`. Their times are by the
-    /// clock of `now`. They are in the next maps until they are too old, and lend identities to objects that tracking
-    /// finds where they are.
+    /// Sets all objects of other cells near this cell, with the ages that they had at `stated_at`.
+    /// Their times are by the clock of `now`. They are included in the next maps until they are too
+    /// old, and their identities are given to objects that tracking finds at the same place.
     pub fn take_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
         if let Some(tracks) = &mut self.tracks {
             tracks.take_neighbours(objects, stated_at);
@@ -447,8 +457,9 @@ impl Aggregator {
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }
 
-    /// Notes the cell's time less the time given as `now` in microseconds, 0 at first. Reports and rounds are dated in the
-    /// cell's time, which may jump; everything else goes by `now`, which does not.
+    /// Sets the cell's time minus the time given as `now`, in microseconds; initially 0. Reports
+    /// and rounds are dated in the cell's time, which may jump; everything else uses `now`, which
+    /// does not.
     pub fn set_cell_offset(&mut self, offset_us: i64) {
         self.cell_offset_us = offset_us;
         self.windows
@@ -472,7 +483,8 @@ impl Aggregator {
             .unwrap_or_default()
     }
 
-    /// Number of reports so far that only tracking used, because a later one of their vehicle came before.
+    /// Number of reports so far that only tracking used, because a later report of their vehicle
+    /// arrived first.
     pub fn overtaken(&self) -> u64 {
         self.overtaken
     }
@@ -493,7 +505,8 @@ impl Aggregator {
         at.shifted(self.cell_offset_us)
     }
 
-    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as published.
+    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as
+    /// published.
     fn agree(
         &self,
         places: Vec<LandmarkState>,
@@ -586,7 +599,7 @@ impl Aggregator {
         });
         let mut verdicts =
             verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
-        // What this aggregator publishes passes the check of those who receive it.
+        // Every published entry must pass the receivers' check.
         left_out.extend(
             map.as_mut()
                 .map(Payload::remove_invalid)
@@ -614,8 +627,8 @@ impl Aggregator {
     }
 }
 
-/// The report as its vehicle's: what a part saw, its vehicle saw. So the parts of a vehicle are one witness, with one
-/// reputation.
+/// The report under the name of its vehicle, so that the parts of a vehicle are one witness with
+/// one reputation.
 fn of_vehicle(report: &Arc<ObjectReport>) -> Arc<ObjectReport> {
     let vehicle = report.node.vehicle();
     if vehicle == report.node {

@@ -1,9 +1,10 @@
-//! One-to-one assignment with the greatest total benefit: the global nearest neighbour (Blackman, Popoli, "Design and
-//! Analysis of Modern Tracking Systems", 1999, chapter 6.4), by the algorithm of Kuhn and Munkres.
+//! One-to-one assignment with the greatest total benefit: the global nearest neighbour (Blackman,
+//! Popoli, "Design and Analysis of Modern Tracking Systems", 1999, chapter 6.4), by the algorithm
+//! of Kuhn and Munkres.
 //!
-//! PACE assigns objects to places, the tracker detections to tracks, the evaluation reported objects to true ones.
-//! Candidates that share a row or a column, directly or through others, form a cluster. Each cluster is solved alone;
-//! most have one candidate.
+//! PACE assigns objects to places, the tracker detections to tracks, the evaluation reported
+//! objects to true ones. Candidates that share a row or a column, directly or through others, form
+//! a cluster. Each cluster is solved alone; most have one candidate.
 
 use hashbrown::HashMap;
 use pathfinding::kuhn_munkres::kuhn_munkres;
@@ -11,15 +12,16 @@ use pathfinding::matrix::Matrix;
 
 /// A row and a column that may be assigned to each other.
 pub trait Candidate: Copy {
-    /// True if the matrix of a cluster has a spare column for each row. Only the choice between assignments of equal
-    /// benefit depends on it.
+    /// True if the matrix of a cluster has a spare column for each row. Only the choice between
+    /// assignments of equal benefit depends on it.
     const SPARE_COLUMNS: bool = false;
 
     /// Number of the row; a table has a place for each up to the highest.
     fn row(&self) -> u32;
     /// Number of the column.
     fn column(&self) -> u32;
-    /// Benefit of the assignment in fixed-point units of the caller, greater than 0. Integers add up exactly.
+    /// Benefit of the assignment in fixed-point units of the caller, greater than 0. Integers add
+    /// up exactly.
     fn benefit(&self) -> i64;
 }
 
@@ -32,10 +34,11 @@ pub struct ClusterSize {
     pub columns: usize,
 }
 
-/// The best assignments, at most one for each row and each column, cluster by cluster. A row without a column costs
-/// nothing.
+/// The best assignments, at most one for each row and each column, cluster by cluster. A row may
+/// remain without a column at no cost.
 ///
-/// `limit` may assign a cluster in its own way: the time to solve one grows with the cube of its size.
+/// `limit` may assign a large cluster by other means, because the time to solve a cluster grows
+/// with the cube of its size.
 pub fn assign<C: Candidate>(
     candidates: Vec<C>,
     limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,

@@ -1,4 +1,5 @@
-//! Sections of the configuration: defaults, allowed ranges, and errors that name key, value and range.
+//! Sections of the configuration: defaults, allowed ranges, and errors that name key, value and
+//! range.
 
 use std::fmt::Display;
 
@@ -24,7 +25,8 @@ impl ConfigError {
         }
     }
 
-    /// The same error with the key below `section`; an error without a key gets that of the section.
+    /// The same error with the key prefixed by `section`; an error without a key gets the section
+    /// as its key.
     #[must_use]
     pub fn within(mut self, section: &str) -> Self {
         self.key = if self.key.is_empty() {
@@ -36,8 +38,8 @@ impl ConfigError {
     }
 }
 
-/// Defines a section of the configuration: the default of each field and its check, if any, stand beside its
-/// documentation. A check is a range, which may name other fields, or a function.
+/// Defines a section of the configuration: the default of each field and its check, if any, stand
+/// next to its documentation. A check is a range, which may name other fields, or a function.
 ///
 /// Generates the struct, its `Default` and `validate`.
 macro_rules! config_section {
@@ -62,7 +64,8 @@ macro_rules! config_section {
             /// Checks all values.
             ///
             /// # Errors
-            /// [`ConfigError`](crate::config::ConfigError) that names the first key out of range.
+            /// Returns a [`ConfigError`](crate::config::ConfigError) that names the first key out
+            /// of range.
             pub fn validate(&self) -> Result<(), crate::config::ConfigError> {
                 #[allow(unused_variables)]
                 let Self { $($field,)* } = self;
@@ -78,7 +81,7 @@ pub(crate) use config_section;
 /// Checks that `value` is a number from `low` to `high`.
 ///
 /// # Errors
-/// [`ConfigError`] otherwise, also for NaN.
+/// Returns a [`ConfigError`] otherwise, also for NaN.
 pub fn check_range(key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
     if (low..=high).contains(&value) {
         Ok(())

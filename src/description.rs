@@ -1,28 +1,33 @@
-//! The description of a cell at one node: which one is the newest, who is told, and what is believed.
+//! The description of a cell at one node: selects the newest description, distributes it, and
+//! decides which descriptions to accept.
 //!
 //! ```text
 //! candidate set  -> all         stamp      in election messages, authenticated
 //! candidate set  -> brokers     description, retained on `cell`
 //! ```
 //!
-//! A description is taken if its stamp equals what others state about themselves: an operator's node, or two nodes that
-//! may lead, or the leader where no description is known yet. So the body needs no signature, and no other single member
-//! can change the cell. Nodes that never lead follow.
+//! A node accepts a description if other nodes state its stamp as their own: an operator's node, or
+//! two nodes that may lead, or the leader if the node has no description yet. The body therefore
+//! needs no signature, and other members cannot change the cell alone. Nodes that cannot lead only
+//! follow.
 //!
-//! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`] for every body,
-//! [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership and membership change,
-//! [`DescriptionExchange::revoke`] when certificates are revoked, and [`DescriptionExchange::tick`] about twice in
-//! [`PUBLISH_INTERVAL`]. Equal inputs give equal effects.
+//! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`]
+//! for every body, [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership
+//! and membership change, [`DescriptionExchange::revoke`] when certificates are revoked, and
+//! [`DescriptionExchange::tick`] about twice in [`PUBLISH_INTERVAL`]. Equal inputs give equal
+//! effects.
 //!
 //! # Merge
 //!
-//! The greater [`DescriptionStamp`] stays: the later version, of two equal ones the greater hash. So all sides of a
-//! split agree when they meet, whatever the order. A version that is far ahead changes nothing and is counted.
+//! The greater [`DescriptionStamp`] wins: the later version or, between equal versions, the greater
+//! hash. After a split heals, all sides therefore agree, independent of the order of messages. A
+//! version that is implausibly far ahead is ignored and counted.
 //!
 //! # Revocation
 //!
-//! The maker of a description states it first: at least one other candidate has it from there. When the certificate of
-//! that node is revoked, such a candidate publishes the description before in a new version, which all take.
+//! The node at which a description was set states it first, so at least one other candidate has it
+//! from that node. When the certificate of that node is revoked, such a candidate publishes the
+//! previous description under a new version, which all nodes accept.
 
 mod history;
 
@@ -36,30 +41,32 @@ use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, S
 use history::MAX_AUTHORS;
 pub use history::{AttributedDescription, DescriptionHistory};
 
-/// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
+/// Largest rise of the version that one message may state. A cell uses one version for each change
+/// by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;
 
-/// Largest version that a node without a description takes from others than its leader.
+/// Largest version that a node without a description accepts from nodes other than its leader.
 pub const MAX_FIRST_VERSION: u64 = 1 << 40;
 
-/// Minimum time between the first two publications of one description; it doubles with each further one.
+/// Minimum time between the first two publications of one description; it doubles with each further
+/// one.
 pub const PUBLISH_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Maximum number of doublings: a node that never has the description costs the others little.
+/// Maximum number of doublings: a node that fails to get the description causes little traffic.
 const MAX_DOUBLINGS: u32 = 5;
 
-/// Number of nodes that may lead on whose equal statements a description is taken that no operator's node states, because
-/// it is away. One of them alone cannot change the cell.
+/// Number of nodes that may lead whose equal statements are sufficient if no operator's node is
+/// available. A single one of them cannot change the cell.
 const MIN_WITNESSES: usize = 2;
 
-/// Maximum number of bodies that wait for the word of a candidate; the oldest gives way.
+/// Maximum number of bodies that wait for a candidate's statement; the oldest is dropped first.
 const MAX_UNPROVEN: usize = 4;
 
-/// Maximum number of descriptions of others that are adopted at once; more wait [`ADOPTION_INTERVAL`] each. Each is
-/// written to disk and logged.
+/// Maximum number of other nodes' descriptions that are adopted at once; each further one waits
+/// [`ADOPTION_INTERVAL`]. Each is written to disk and logged.
 const MAX_ADOPTIONS: usize = 8;
 
-/// Average time between two adoptions of a node that is told of ever new descriptions.
+/// Average time between two adoptions at a node that keeps receiving new descriptions.
 const ADOPTION_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Maximum number of nodes whose stamps are kept.
@@ -68,7 +75,7 @@ const MAX_NODES: usize = 4096;
 /// Something that the actors of a node must do, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum DescriptionEffect {
-    /// Save a description, apply it, and tell other nodes which one this node has.
+    /// Save a description, apply it, and announce to other nodes that this node has it.
     Adopt {
         /// The description.
         description: Arc<CellDescription>,
@@ -87,7 +94,7 @@ pub enum DescriptionEffect {
     },
 }
 
-/// The leader as far as it matters here.
+/// The leader, as far as it is relevant here.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 enum Leader {
     #[default]
@@ -96,7 +103,7 @@ enum Leader {
     Other(NodeName),
 }
 
-/// Word of a node about its description.
+/// A node's statement about its description.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DescriptionStatement {
     /// Version and hash.
@@ -105,17 +112,17 @@ pub struct DescriptionStatement {
     pub may_lead: bool,
     /// True if the node is an operator's, which may set descriptions.
     pub may_describe: bool,
-    /// Its certificate in base64; none in a cell without certificates.
+    /// The node's certificate in base64; `None` in a cell without certificates.
     pub certificate: Option<String>,
 }
 
-/// One node's part in the exchange of descriptions; see the module.
+/// The exchange of descriptions on one node; see the module.
 #[derive(Debug, Clone)]
 pub struct DescriptionExchange {
     name: NodeName,
     may_lead: bool,
     history: DescriptionHistory,
-    /// Last word of each node.
+    /// Last statement of each node.
     statements: BTreeMap<NodeName, DescriptionStatement>,
     /// Bodies that no candidate has stated yet, oldest first.
     unproven: VecDeque<Arc<CellDescription>>,
@@ -124,13 +131,14 @@ pub struct DescriptionExchange {
     leader: Leader,
     /// True if brokers may lack the description.
     is_due: bool,
-    /// Time of the last publication, and the number of those since the description or the leader changed.
+    /// Time of the last publication, and number of publications since the description or the leader
+    /// changed.
     published: Option<(Timestamp, u32)>,
     effects: Vec<DescriptionEffect>,
 }
 
 impl DescriptionExchange {
-    /// The exchange of a node that starts with what it had saved.
+    /// Creates the exchange of a node that starts with its saved descriptions.
     pub fn new(name: NodeName, may_lead: bool, saved: DescriptionHistory) -> Self {
         Self {
             name,
@@ -146,7 +154,7 @@ impl DescriptionExchange {
         }
     }
 
-    /// The description that counts here.
+    /// The description that this node uses.
     pub fn current(&self) -> Option<&Arc<CellDescription>> {
         self.history
             .current
@@ -154,7 +162,7 @@ impl DescriptionExchange {
             .map(|current| &current.description)
     }
 
-    /// The same with those before, as it is to be saved.
+    /// The current and earlier descriptions, in the form to be saved.
     pub fn history(&self) -> &DescriptionHistory {
         &self.history
     }
@@ -166,7 +174,7 @@ impl DescriptionExchange {
             .unwrap_or_default()
     }
 
-    /// Takes the authenticated word of a node about its description.
+    /// Processes a node's authenticated statement about its description.
     pub fn hear(
         &mut self,
         from: &NodeName,
@@ -189,7 +197,7 @@ impl DescriptionExchange {
         self.finish(now)
     }
 
-    /// Takes a body from a broker; `description.hash` must be that of its content.
+    /// Processes a body received from a broker; `description.hash` must be the hash of its content.
     pub fn take(
         &mut self,
         description: Arc<CellDescription>,
@@ -197,7 +205,7 @@ impl DescriptionExchange {
     ) -> Vec<DescriptionEffect> {
         let stamp = description.stamp();
         if stamp < self.stamp() {
-            // It may have taken the place of the right one at the broker.
+            // This body may have replaced the right one at the broker.
             self.is_due = true;
         } else if stamp > self.stamp() {
             self.is_due = true;
@@ -211,8 +219,8 @@ impl DescriptionExchange {
         self.finish(now)
     }
 
-    /// Sets the cell's description at this node, which may lead. Nothing happens if the content is that of the present
-    /// one.
+    /// Sets the cell's description at this node, which may lead. Does not change the state if the
+    /// content equals the current description.
     pub fn set(
         &mut self,
         text: String,
@@ -234,9 +242,10 @@ impl DescriptionExchange {
         self.finish(now)
     }
 
-    /// Drops the descriptions and the word of nodes whose certificates were revoked. A node that may lead goes back to the
-    /// latest other description, or to none: an empty text, whose hash is `empty`. It gets a new version, so that nodes that
-    /// have not read the revocation list take it, too.
+    /// Drops the descriptions and statements of nodes whose certificates were revoked. A node that
+    /// may lead goes back to the latest other description, or to an empty text whose hash is
+    /// `empty`. The description gets a new version, so that nodes that have not read the revocation
+    /// list accept it too.
     pub fn revoke(
         &mut self,
         is_revoked: impl Fn(&str) -> bool,
@@ -246,7 +255,7 @@ impl DescriptionExchange {
         let version = self.next_version();
         self.statements
             .retain(|_, statement| !statement.certificate.as_deref().is_some_and(&is_revoked));
-        // Descriptions of the revoked do not delay the right one.
+        // Descriptions of revoked nodes must not delay the right one.
         self.adopted.clear();
         if self.may_lead && self.history.drop_revoked(is_revoked) {
             let before = self.history.current.take().map_or_else(
@@ -286,8 +295,8 @@ impl DescriptionExchange {
         .into()
     }
 
-    /// The version of a change here. Those that have what this node has must be able to take it, whatever somebody else has
-    /// stated.
+    /// The version of a change made at this node. Nodes that have this node's description must be
+    /// able to accept it, independent of statements of other nodes.
     fn next_version(&self) -> u64 {
         let of_candidates = self
             .statements
@@ -303,7 +312,7 @@ impl DescriptionExchange {
             .min(self.highest_plausible())
     }
 
-    /// Notes who leads.
+    /// Sets the current leader.
     pub fn lead(&mut self, leader: Option<&NodeName>, now: Timestamp) -> Vec<DescriptionEffect> {
         let leader = match leader {
             None => Leader::Unknown,
@@ -318,25 +327,26 @@ impl DescriptionExchange {
         self.finish(now)
     }
 
-    /// Notes a new connection to a broker, which may not have the description.
+    /// Records a new connection to a broker, which may lack the description.
     pub fn connect(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
         self.is_due = true;
         self.finish(now)
     }
 
-    /// Forgets the word of nodes that are gone.
+    /// Drops the statements of nodes that have left.
     pub fn retain(&mut self, is_member: impl Fn(&NodeName) -> bool) {
         self.statements.retain(|node, _| is_member(node));
     }
 
-    /// Repeats what others still lack, and adopts what had to wait.
+    /// Repeats publications for nodes that still lack the description, and adopts descriptions that
+    /// had to wait.
     pub fn tick(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
         self.adopt_proven(now);
         self.finish(now)
     }
 
-    /// Highest version that may follow from the one that is known. The leader's own word is believed beyond it: so who
-    /// comes late or was away gets the cell's.
+    /// Highest version that may plausibly follow the current one. The leader's own statement is
+    /// accepted beyond it, so that a node that starts late or was away gets the cell's description.
     fn highest_plausible(&self) -> u64 {
         let known = self.stamp().version;
         let highest = if known == 0 {
@@ -347,7 +357,8 @@ impl DescriptionExchange {
         highest.min(MAX_INTEGER)
     }
 
-    /// Adopts the greatest body that enough candidates state, unless too many were adopted lately.
+    /// Adopts the greatest body that enough candidates state, unless too many were adopted
+    /// recently.
     fn adopt_proven(&mut self, now: Timestamp) {
         let authors = |stamp: DescriptionStamp| {
             self.statements
@@ -391,8 +402,9 @@ impl DescriptionExchange {
         );
     }
 
-    /// The node on whose statement a description is adopted: of those that state it, an operator's, or the leader where no
-    /// description is known yet, or any where there are [`MIN_WITNESSES`].
+    /// The node whose statement justifies adopting a description: an operator's node that states
+    /// it, or the leader if this node has no description yet, or any node if at least
+    /// [`MIN_WITNESSES`] state it.
     fn witness<'a>(
         &self,
         authors: &(impl Iterator<Item = (&'a NodeName, &'a DescriptionStatement)> + Clone),
@@ -429,7 +441,8 @@ impl DescriptionExchange {
             .push(DescriptionEffect::Publish { description });
     }
 
-    /// Publishes what somebody lacks: the leader to all, another candidate to a leader that is behind.
+    /// Publishes a description that other nodes lack: the leader publishes to all, another
+    /// candidate to a leader that is behind.
     fn finish(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
         if let Some(description) = self.current().cloned()
             && self.may_lead

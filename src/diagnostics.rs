@@ -1,7 +1,9 @@
-//! Present troubles of a node and of the vehicles that it hears: each with its cause and its remedy.
+//! Current troubles of a node and of the vehicles that it receives: each with its cause and its
+//! remedy.
 //!
-//! Parts of a node tell a [`TroubleRegister`] what they see, again and again while it lasts. The register keeps few
-//! entries, forgets those that are over, and says which are news for the log. `docs/troubleshooting.md` lists all kinds.
+//! The parts of a node report their observations to a [`TroubleRegister`] repeatedly while a
+//! trouble lasts. The register keeps a bounded number of entries, drops those that are over, and
+//! returns new troubles for the log. `docs/troubleshooting.md` lists all kinds.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -10,7 +12,8 @@ use crate::model::names::{MAX_NAME_BYTES, plain_text};
 use crate::model::time::Timestamp;
 use crate::wire::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 
-/// Defines the kinds with their names on the wire, how long they count after they were last seen, and their remedies.
+/// Defines the kinds with their names on the wire, how long they count after they were last seen,
+/// and their remedies.
 macro_rules! trouble_kinds {
     ($($(#[$doc:meta])* $kind:ident = $name:literal, $lasts:expr, $remedy:literal;)*) => {
         /// A kind of trouble.
@@ -47,11 +50,12 @@ macro_rules! trouble_kinds {
     };
 }
 
-/// For what is seen with every report.
+/// For troubles observed with every report.
 const SHORT: Duration = Duration::from_secs(10);
-/// For what is seen with greetings, which are rare once a cell is complete, and with attempts to connect.
+/// For troubles observed with greetings, which are rare once a cell is complete, and with attempts
+/// to connect.
 const LONG: Duration = Duration::from_secs(60);
-/// For what lasts until its part says that it is over.
+/// For troubles that last until the reporting part settles them.
 const UNTIL_SETTLED: Duration = Duration::MAX;
 
 trouble_kinds! {
@@ -61,25 +65,25 @@ trouble_kinds! {
     Untimely = "untimely", SHORT, "run a time service where its reports are made, such as chrony";
     /// A clock differs from the cell's time by seconds.
     ClockOff = "clock_off", SHORT, "run a time service on it, such as chrony";
-    /// The camera gives no frames.
+    /// The camera delivers no frames.
     Camera = "camera", UNTIL_SETTLED, "`ecod-node doctor` tries the camera and names what is missing";
-    /// The pose of the camera is not known, so that its frames have no place.
+    /// The pose of the camera is unavailable, so the detections in its frames cannot be placed.
     NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
     /// Detections of a label that has no size.
     NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.mount.height_m` to range it by the ground";
-    /// None of the detections has a place.
+    /// All detections lack a place.
     NotPlaced = "not_placed", SHORT, "let the camera see whole objects, or correct `camera.mount` and `camera.projection`";
-    /// A camera that looks elsewhere than its mount says.
+    /// The camera points in another direction than its mount states.
     MountMismatch = "mount_mismatch", SHORT, "measure `camera.mount` again, as by `ecod-node calibrate mount`, or correct the sizes of the objects that it sees";
     /// A size in another unit than metres.
     ImplausibleSize = "implausible_size", UNTIL_SETTLED, "sizes are in metres: correct `camera.projection.sizes`";
     /// Another value that looks as if it were in another unit.
     ImplausibleUnit = "implausible_unit", UNTIL_SETTLED, "correct it in this node's configuration or the cell's description; if it is meant so, leave it";
-    /// Vehicles name known locations, and the aggregator has none.
+    /// Vehicles name landmarks, but the aggregator has no landmarks.
     NoLocations = "no_locations", SHORT, "give this node the cell's `landmarks`, or the cell a description: `ecod-node cell set`";
-    /// A vehicle names a location that the aggregator does not know.
+    /// A vehicle names a landmark that the aggregator does not have.
     UnknownLocation = "unknown_location", SHORT, "give all nodes the same `landmarks`: `ecod-node cell set`";
-    /// Objects that are where none can be.
+    /// Objects at impossible places.
     Misplaced = "misplaced", SHORT, "positions are in metres in the cell's frame: correct its pose, its program or the list of locations";
     /// The node does not use the cell's description.
     Description = "description", UNTIL_SETTLED, "`ecod-node cell diff` shows the difference";
@@ -101,13 +105,13 @@ trouble_kinds! {
     NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
     /// A second running node of a name.
     NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
-    /// A seed that does not answer a node which knows of no other.
+    /// An unanswered seed at a node that has discovered no other member.
     SeedSilent = "seed_silent", LONG, "start it, give both nodes the same `cell` and key, or let UDP through; without such a node, remove it from `membership.seeds`";
     /// A host name without an address.
     Unresolved = "unresolved", LONG, "correct the name, or the name service of this machine";
     /// A broker that cannot be reached.
     BrokerUnreachable = "broker_unreachable", LONG, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
-    /// A broker that does not let this node do what it must.
+    /// A broker that refuses a necessary operation of this node.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
     /// The region's broker cannot be reached.
     UplinkUnreachable = "uplink_unreachable", LONG, "look at the link to the region, and whether its broker runs; the cell goes on without it";
@@ -127,7 +131,7 @@ impl TroubleKind {
         Self::ALL.iter().copied().find(|kind| kind.as_str() == name)
     }
 
-    /// True if it is noted for each message, so that its rate tells something.
+    /// True if the trouble is recorded for each message, so that its rate is meaningful.
     fn is_counted(self) -> bool {
         matches!(
             self,
@@ -149,7 +153,7 @@ impl TroubleKind {
         matches!(self, Self::Untimely | Self::Malformed | Self::NotPermitted)
     }
 
-    /// True if a node with this trouble of its own does not do its work.
+    /// True if a node with this trouble cannot do its work.
     pub fn is_disabling(self) -> bool {
         matches!(self, Self::ReportsRefused | Self::Camera | Self::NoPose)
     }
@@ -173,25 +177,27 @@ impl TroubleKind {
 /// Minimum time between two lines of the log about the same trouble.
 const LOG_INTERVAL: Duration = Duration::from_secs(3600);
 
-/// The same for another cause of it.
+/// The same interval for another cause of the trouble.
 const NEW_CAUSE_INTERVAL: Duration = Duration::from_secs(60);
 
-/// Minimum time between two changes of a cause's figures, and of the words of what each message may cause.
+/// Minimum time between two updates of a cause's figures, and of the text of causes that any
+/// message may produce.
 const TEXT_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Maximum troubles that are kept about the same vehicle or host, those that strangers may cause, and all that may be about
-/// others than the node.
+/// Maximum number of stored troubles: about one vehicle or host, of kinds that outside hosts can
+/// cause, and about all nodes other than this one.
 const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
 
-/// The subject of a trouble, none for the node itself, and its kind.
+/// The subject of a trouble (`None` for the node itself) and its kind.
 type Key = (Option<String>, TroubleKind);
 
-/// The troubles that a node knows of.
+/// The current troubles of a node.
 #[derive(Debug, Clone, Default)]
 pub struct TroubleRegister {
-    /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not logged each time.
+    /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not
+    /// logged each time.
     entries: BTreeMap<Key, KnownTrouble>,
 }
 
@@ -199,7 +205,7 @@ pub struct TroubleRegister {
 struct KnownTrouble {
     shown: Trouble,
     shown_at: Timestamp,
-    /// The cause that is shown, and the one that was logged, without their figures.
+    /// The displayed cause and the logged cause, without their figures.
     gist: String,
     logged_gist: String,
     /// Number of times that it was seen since it is shown.
@@ -216,7 +222,8 @@ impl KnownTrouble {
 }
 
 impl TroubleRegister {
-    /// Notes a trouble of the node itself, or about another; returns it if it is news for the log.
+    /// Records a trouble of the node itself, or about another; returns it if it is news for the
+    /// log.
     pub fn note(
         &mut self,
         kind: TroubleKind,
@@ -227,7 +234,8 @@ impl TroubleRegister {
         self.note_with(kind, about, || cause.to_owned(), kind.remedy(), now)
     }
 
-    /// Notes a trouble with a remedy that another node may have given. The cause is asked for when its words are needed.
+    /// Records a trouble with a remedy that another node may have supplied. The text of the cause
+    /// is only requested when it is needed.
     pub fn note_with(
         &mut self,
         kind: TroubleKind,
@@ -298,14 +306,14 @@ impl TroubleRegister {
         Some(news)
     }
 
-    /// Notes that a trouble is over.
+    /// Records that a trouble is over.
     pub fn settle(&mut self, kind: TroubleKind, about: Option<&str>) {
         if let Some(entry) = self.entries.get_mut(&key(kind, about)) {
             entry.is_settled = true;
         }
     }
 
-    /// Notes that all troubles of a kind are over, whomever they are about.
+    /// Records that all troubles of a kind are over, for all subjects.
     pub fn settle_all(&mut self, kind: TroubleKind) {
         let of_kind = self
             .entries
@@ -324,8 +332,8 @@ impl TroubleRegister {
             .collect()
     }
 
-    /// True if there is room for one more entry: lapsed ones of the crowd that it belongs to give way, the longest unseen
-    /// first.
+    /// True if there is room for one more entry. Lapsed entries of the same group are removed if
+    /// necessary, the longest unseen first.
     fn make_room(&mut self, (about, kind): &Key, now: Timestamp) -> bool {
         if about.is_none() {
             return true;
@@ -336,7 +344,7 @@ impl TroubleRegister {
             && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
     }
 
-    /// The same for one crowd of at most so many entries.
+    /// The same check for one group of at most `most` entries.
     fn make_room_in(&mut self, most: usize, now: Timestamp, is_in: impl Fn(&Key) -> bool) -> bool {
         while self.entries.keys().filter(|key| is_in(key)).count() >= most {
             let lapsed = self
@@ -361,7 +369,7 @@ fn key(kind: TroubleKind, about: Option<&str>) -> Key {
     (about.map(name), kind)
 }
 
-/// A text of at most so many bytes, with an ellipsis after the last whole word if it is longer.
+/// A text of at most `max_bytes` bytes, with an ellipsis after the last whole word if it is longer.
 fn shortened(text: &str, max_bytes: usize) -> String {
     const ELLIPSIS: &str = " …";
     if text.len() <= max_bytes {
@@ -471,7 +479,8 @@ mod tests {
         assert!(register.present(at(100_000)).is_empty());
     }
 
-    /// Names come from outside: whoever invents them displaces neither the node's own troubles nor those of others.
+    /// Names come from outside: a host that invents names displaces the entries of neither this
+    /// node nor other nodes.
     #[test]
     fn invented_names_find_no_room_and_leave_none_of_theirs_behind() {
         let mut register = TroubleRegister::default();

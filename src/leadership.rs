@@ -1,17 +1,17 @@
-//! Leadership: who leads the cell, and whose rounds a node accepts.
+//! Leadership: the election of the cell's leader, and the acceptance of its rounds.
 //!
 //! | step | machine |
 //! |---|---|
-//! | nodes elect a leader and hand the lead over | [`election::Election`] |
+//! | nodes elect a leader and hand leadership over | [`election::Election`] |
 //! | a node is fit to lead while its parts work | [`health::HealthMonitor`], [`echo::EchoMonitor`] |
 //! | a node keeps links to the brokers of leader and standby | [`links::Links`] |
-//! | all of that, as one machine of inputs and effects | [`node::LeadershipNode`] |
+//! | the steps above combined into one machine of inputs and effects | [`node::LeadershipNode`] |
 //! | receivers accept or refuse each round | [`round_filter::RoundFilter`], [`round_filter::PublisherFilter`] |
 //! | nodes agree on the cell's time | [`cell_time::CellTime`] |
 //! | candidates replicate the evidence about vehicles | [`ledger_resync::LedgerResync`] |
 //!
-//! Machines meet in one value, [`Leadership`]: the node tells it, all others read it. [`timers`] relates every timer to the
-//! others.
+//! The machines share one value, [`Leadership`]: [`node::LeadershipNode`] writes it and all other
+//! machines read it. [`timers`] lists every timer and how it relates to the others.
 
 pub mod address;
 pub mod cell_time;

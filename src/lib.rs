@@ -1,8 +1,10 @@
-//! The core of ECOD: values, algorithms and state machines for vehicles that see together.
+//! The core of ECOD: values, algorithms and state machines for collaborative perception by camera
+//! vehicles.
 //!
-//! Nothing here reads a clock, opens a socket or spawns a task: time is an argument, effects are return values, and
-//! equal inputs give equal outputs. Lengths are metres, angles radians, positions east-north with counter-clockwise
-//! headings; other units are converted where they enter.
+//! The crate reads no clock, opens no socket and spawns no task: time is an argument, effects are
+//! return values, and equal inputs give equal outputs. Lengths are metres, angles radians,
+//! positions east-north with counter-clockwise headings; other units are converted where they
+//! enter.
 
 #![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![cfg_attr(not(test), deny(clippy::string_slice))]

@@ -1,4 +1,4 @@
-//! The vocabulary of a cell: names, time, geometry, epochs, detections. Imports no other room but `config`.
+//! The vocabulary of a cell: names, time, geometry, epochs, detections. Depends only on `config`.
 
 pub mod detection;
 pub mod epoch;

@@ -1,14 +1,18 @@
-//! Neighbouring cells: which of their maps count, and which of their objects are near this cell.
+//! Neighbouring cells: admits their maps and selects the objects near this cell.
 //!
-//! Call [`Neighbours::accept`] with every map of another cell and [`Neighbours::observe_own`] with every map of this one.
-//! When either has changed anything, [`Neighbours::near`] has what the aggregator is told next, by
-//! [`Command::TakeNeighbours`](crate::aggregator::Command::TakeNeighbours). That command is recorded, so replays are exact.
+//! Call [`Neighbours::accept`] with every map of another cell and [`Neighbours::observe_own`] with
+//! every map of this cell. When either call changed the state, pass the objects of
+//! [`Neighbours::near`] to the aggregator by
+//! [`Command::TakeNeighbours`](crate::aggregator::Command::TakeNeighbours). That command is
+//! recorded, so replays are exact.
 //!
-//! - A cell tells of its own tile and of [`COVER_M`] around it. Objects elsewhere are refused and counted.
-//! - Maps count in the order of epoch and round, and no older than [`MAX_AGE`]. [`CellMapFilter`] says how age is known.
-//! - Objects are put into this cell's frame through their place on Earth.
+//! - A cell may report objects in its own tile and within [`COVER_M`] around it. Objects elsewhere
+//!   are refused and counted.
+//! - Maps must arrive in the order of epoch and round, and be no older than [`MAX_AGE`].
+//!   [`CellMapFilter`] determines their age.
+//! - Objects are converted to this cell's frame through their place on Earth.
 //!
-//! [`ReputationExchange`] says what cells tell each other of vehicles.
+//! [`ReputationExchange`] handles the counts about vehicles that cells exchange.
 
 mod area;
 mod extent;
@@ -35,35 +39,40 @@ use crate::wire::{CellMap, FusedObject, GlobalMap, NeighbourObject, RegionTopic,
 use extent::Extent;
 use frame::FrameChange;
 
-/// Distance in metres from its tile up to which a cell may tell of objects. An origin in the middle of its cell leaves
-/// room for a cell 600 m across, wherever in the tile it is.
+/// Distance in metres from its tile up to which a cell may report objects. A cell with its origin
+/// in the middle may be 600 m across, at any position within the tile.
 pub const COVER_M: f64 = 300.0;
 
-/// Maximum maps per second of one cell that a receiver decodes, twice as many as a neighbour sends by default.
+/// Maximum maps per second of one cell that a receiver decodes, twice as many as a neighbour sends
+/// by default.
 pub const MAX_MAP_HZ: u32 = 20;
 
-/// Distance in metres from what this cell knows up to which objects of others are handed on: 7 s at 50 km/h.
+/// Distance in metres from this cell's own area up to which objects of other cells are used: 7 s at
+/// 50 km/h.
 const MARGIN_M: f64 = 100.0;
 
 /// Maximum number of neighbouring cells.
 const MAX_CELLS: usize = 256;
 
-/// Maximum number of objects of all neighbouring cells together. Each is compared with each that was known before.
+/// Maximum number of objects of all neighbouring cells together. Each is compared with every
+/// earlier object.
 const MAX_OBJECTS: usize = 512;
 
 /// Maximum number of objects of one cell, so that it leaves room for others.
 const MAX_OBJECTS_EACH: usize = 128;
 
-/// Maximum number of classes with scores of an object; of one with more, only the label is taken.
+/// Maximum number of classes with scores per object; of an object with more scores, only the label
+/// is used.
 const MAX_SCORES: usize = 8;
 
-/// Longest time for which an object counts as seen: a cell that dates its objects far back owns no identity by that.
+/// Maximum time for which an object counts as seen, so that a cell cannot claim an identity by
+/// dating its objects far back.
 const MAX_SEEN_FOR: Duration = Duration::from_secs(600);
 
 /// Objects of accepted maps that were not used.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct NeighbourLosses {
-    /// Outside of what their cell may tell of.
+    /// Objects outside of the area that their cell may report.
     pub outside: u64,
     /// Beyond the maximum number.
     pub refused: u64,
@@ -90,7 +99,7 @@ struct NeighbourMap {
 }
 
 impl Neighbours {
-    /// No neighbours yet of a cell at `origin`.
+    /// Creates the state of a cell at `origin`, without neighbours.
     pub fn new(cell: NodeName, origin: GeographicOrigin) -> Self {
         Self {
             cell,
@@ -107,10 +116,12 @@ impl Neighbours {
         Quadkey::of_cell(&self.origin).with_neighbours()
     }
 
-    /// Takes a map of another cell, which came on `topic` and was read at `received_at` by this node's steady clock.
+    /// Processes a map of another cell that was received on `topic` and read at `received_at` by
+    /// this node's steady clock.
     ///
     /// # Errors
-    /// The reason why it does not count; at most the estimate of that cell's clock has changed.
+    /// Returns the reason why the map is ignored. In this case only the estimate of that cell's
+    /// clock may have changed.
     pub fn accept(
         &mut self,
         topic: &RegionTopic,
@@ -148,8 +159,8 @@ impl Neighbours {
             if object.scores.len() > MAX_SCORES {
                 object.scores.clear();
             }
-            // Values that are valid in its own frame need not be so in this one. Receivers refuse a map with one
-            // wrong value.
+            // Values that are valid in the other cell's frame may be invalid in this one. Receivers
+            // refuse a map with one wrong value.
             if object.validate().is_err() {
                 losses.refused += 1;
                 continue;
@@ -175,7 +186,7 @@ impl Neighbours {
         Ok(())
     }
 
-    /// Takes a map of this cell, closed at `now`: it tells where this cell is.
+    /// Processes a map of this cell, closed at `now`, which shows the cell's area.
     pub fn observe_own(&mut self, map: &GlobalMap, now: Timestamp) {
         let objects = map
             .objects
@@ -203,7 +214,8 @@ impl Neighbours {
         self.cells.iter().flat_map(of_cell).collect()
     }
 
-    /// Objects by cell that were not used so far; cells that are silent for long are forgotten.
+    /// Number of objects by cell that were not used so far; cells that are silent for long are
+    /// dropped.
     pub fn losses(&self) -> &BTreeMap<NodeName, NeighbourLosses> {
         &self.losses
     }

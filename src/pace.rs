@@ -1,8 +1,9 @@
-//! PACE: one agreed label for every known location, from the reports of all vehicles.
+//! PACE: one agreed label for every landmark, from the reports of all vehicles.
 //!
-//! A [`Pace`] takes admitted reports by [`Pace::observe`] and makes the map by [`Pace::close`]. It has two
-//! implementations: [`paper`](PaceMode::Paper) has the formulas of the paper; [`bayes`](PaceMode::Bayes), the default,
-//! has log-odds for each vehicle. `docs/algorithms.md` compares them.
+//! A [`Pace`] processes admitted reports in [`Pace::observe`] and produces the map in
+//! [`Pace::close`]. It has two implementations: [`paper`](PaceMode::Paper) has the formulas of the
+//! paper; [`bayes`](PaceMode::Bayes), the default, has log-odds for each vehicle.
+//! `docs/algorithms.md` compares them.
 
 mod assignment;
 mod bayes;
@@ -42,42 +43,48 @@ config_section! {
     pub struct PaceConfig {
         /// The implementation. Default `bayes`.
         pub mode: PaceMode = PaceMode::Bayes;
-        /// Largest distance in metres between a detection and its landmark, the paper's δ. Default 0.5. Below half the
-        /// distance between neighbouring landmarks no detection is assigned to a neighbour.
+        /// Largest distance in metres between a detection and its landmark, the paper's δ. Default
+        /// 0.5. Below half the distance between neighbouring landmarks no detection is assigned to
+        /// a neighbour.
         pub gate_m: f64 = 0.5, in 1e-3 to 1e3;
         /// Largest distance in standard deviations of the detection's covariance. Default 4.
         pub gate_sigmas: f64 = 4.0, in 0.1 to 100.0;
-        /// Standard deviation in metres added to every reported covariance. Default 0.05. It covers errors of pose and
-        /// map that vehicles cannot report.
+        /// Standard deviation in metres added to every reported covariance. Default 0.05. It covers
+        /// errors of pose and map that vehicles cannot report.
         pub position_floor_m: f64 = 0.05, in 1e-4 to 100.0;
-        /// True if a landmark takes at most one object of a report. Default true: two plates cannot share one parking
-        /// spot, and where gates overlap the nearer landmark may belong to another object. With false every object
-        /// counts at the nearest landmark.
+        /// True if a landmark takes at most one object of a report. Default true: two plates cannot
+        /// share one parking spot, and where gates overlap the nearer landmark may belong to
+        /// another object. With false every object counts at the nearest landmark.
         pub one_to_one: bool = true;
-        /// Age in seconds beyond which a vehicle's last view of a landmark no longer counts. Default 1.0.
+        /// Age in seconds beyond which a vehicle's last view of a landmark is ignored. Default 1.0.
         pub max_age_s: f64 = 1.0, in 0.01 to 3600.0;
-        /// Probability that an object in view is detected in one frame. Default 0.3: low, so that a few misses do not
-        /// erase a reading. Higher drops labels sooner when objects leave.
+        /// Probability that an object in view is detected in one frame. Default 0.3: low, so that a
+        /// few misses do not erase a reading. Higher drops labels sooner when objects leave.
         pub detection_probability: f64 = 0.3, in 0.01 to 0.99;
-        /// Probability that one frame reports an object where there is none. Default 0.01.
+        /// Probability that one frame reports a non-existent object. Default 0.01.
         pub false_alarm_probability: f64 = 0.01, in 1e-6 to *detection_probability;
-        /// Maximum evidence of one vehicle for or against one label, in nats. Default 4 (odds of 55 to 1).
+        /// Maximum evidence of one vehicle for or against one label, in nats. Default 4 (odds of 55
+        /// to 1).
         pub evidence_limit: f64 = 4.0, in 0.1 to 100.0;
-        /// Maximum evidence of one vehicle against any object at a landmark, in nats. Default 1.1: misses repeat for the
-        /// same hidden cause, so one vehicle that reads a label outweighs three that find nothing, and not four.
+        /// Maximum evidence of one vehicle against any object at a landmark, in nats. Default 1.1:
+        /// misses repeat for the same hidden cause, so one vehicle that reads a label outweighs
+        /// three vehicles with misses, but not four.
         pub absence_limit: f64 = 1.1, in 0.0 to 100.0;
-        /// Time in seconds between independent frames; faster frames count in proportion. Default 0.1.
+        /// Time in seconds between independent frames; faster frames count in proportion. Default
+        /// 0.1.
         pub independent_after_s: f64 = 0.1, in 0.0 to 60.0;
-        /// Evidence in nats against any object from which a landmark is known to be empty. Default 0.9: three misses of
-        /// one vehicle.
+        /// Evidence in nats against any object from which a landmark counts as empty. Default 0.9:
+        /// three misses of one vehicle.
         pub empty_evidence: f64 = 0.9, in 0.01 to 100.0;
-        /// Lead in nats that another label needs over the one published last. Default 0.5; it prevents flicker.
+        /// Lead in nats that another label needs over the one published last. Default 0.5; it
+        /// prevents flicker.
         pub switch_lead: f64 = 0.5, in 0.0 to 100.0;
     }
 }
 
 impl PaceConfig {
-    /// The reported covariance; without one, its default reaches the gate in metres and in sigmas alike.
+    /// The reported covariance; without one, its default reaches the gate in metres and in sigmas
+    /// alike.
     fn covariance(&self, object: &PerceivedObject) -> Covariance {
         object
             .covariance()
@@ -125,7 +132,8 @@ impl Pace {
         }
     }
 
-    /// The same evidence under other settings and for other locations, matched by id. Another mode starts without any.
+    /// The same evidence under other settings and for other locations, matched by id. Another mode
+    /// starts without any.
     #[must_use]
     pub(crate) fn configured(self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         match (self, config.mode) {
@@ -137,7 +145,7 @@ impl Pace {
         }
     }
 
-    /// Adds known locations after those there are; evidence stays.
+    /// Adds landmarks after the existing ones; evidence is kept.
     pub fn add_landmarks(&mut self, added: Vec<Landmark>) {
         match self {
             Self::Paper(pace) => pace.add_landmarks(added),
@@ -145,7 +153,7 @@ impl Pace {
         }
     }
 
-    /// The known locations.
+    /// The landmarks.
     pub fn landmarks(&self) -> &LandmarkIndex {
         self.places().0
     }
@@ -157,7 +165,7 @@ impl Pace {
         }
     }
 
-    /// True if an object names a known location or is within the gate of one.
+    /// True if an object names a landmark or is within the gate of one.
     pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
         let (landmarks, gate_m) = self.places();
         let point = Point2::new(object.x_m, object.y_m);

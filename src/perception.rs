@@ -1,4 +1,4 @@
-//! From pixels to positions: cameras, projection, fields of view, known locations, poses over time.
+//! From pixels to positions: cameras, projection, fields of view, landmarks, poses over time.
 
 pub mod camera;
 pub mod landmark;

@@ -1,12 +1,15 @@
-//! Replay of a recorded cell in virtual time: lines in, maps and verdicts out. Equal input gives equal output.
+//! Replay of a recorded cell in virtual time: lines in, maps and verdicts out. Equal input gives
+//! equal output.
 //!
-//! Call [`Replay::line`] with every line in the order of arrival, then [`Replay::finish`]. Each line is one report as
-//! JSON with two optional fields: `topic`, `"detections"` by default or `"vote_detections"`, and `received_at_us`. The
-//! time of a line is that of receipt or else of capture, but never earlier than that of the line before. An
-//! [`Aggregator`], as in a live node, fuses the reports.
+//! Call [`Replay::line`] with every line in the order of arrival, then [`Replay::finish`]. Each
+//! line is one report as JSON with two optional fields: `topic`, `"detections"` by default or
+//! `"vote_detections"`, and `received_at_us`. The time of a line is its time of receipt or, if
+//! absent, of capture, but not earlier than the time of the previous line. An [`Aggregator`], as in
+//! a live node, fuses the reports.
 //!
-//! - One vehicle with a wrong clock must not make all others stale. A line does not move the time if it is ahead of most
-//!   of the [`LOOKAHEAD`] lines after it, by more than clocks may differ; without passes it is rejected.
+//! - One vehicle with a wrong clock must not make all other reports stale. A line does not move the
+//!   time if it is ahead of most of the [`LOOKAHEAD`] lines after it, by more than clocks may
+//!   differ; without passes it is rejected.
 //! - A silence takes at most ten seconds of rounds; then time continues at the next line.
 //! - Memory is bounded by the cell, not by the recording.
 
@@ -40,11 +43,12 @@ use records::RecordedReport;
 /// Number of lines that are read ahead to distinguish a wrong clock from a silence.
 pub const LOOKAHEAD: usize = 64;
 
-/// Maximum number of locations that an open cell learns for PACE; they are never forgotten.
+/// Maximum number of locations that an open cell adds for PACE; they are kept until the end.
 const MAX_LEARNT_LANDMARKS: usize = 4096;
 
-/// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file is no attacker: labels
-/// are limited by [`MAX_LABELS`] only, the objects of a report by the length of its line.
+/// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file
+/// is no attacker: labels are limited by [`MAX_LABELS`] only, the objects of a report by the length
+/// of its line.
 const MAX_VOTE_LANDMARKS: usize = 1_000_000;
 
 /// Maximum number of rejected lines of one reason whose flaws are kept.
@@ -63,12 +67,13 @@ pub struct ReplayConfig {
     pub aggregator: NodeName,
     /// Settings of fusion; taken as valid.
     pub fusion: FusionConfig,
-    /// The cell's known locations; without any, they are learnt from the reports.
+    /// The cell's landmarks; if empty, locations are derived from the reports.
     pub landmarks: Vec<Landmark>,
     /// Bounds of a line.
     pub limits: Limits,
-    /// Number of times that all stored votes are judged at the end; only the verdicts of the last pass are written. Times
-    /// are ignored then: at each location the last vote of each vehicle in the recording counts.
+    /// Number of times that all stored votes are re-evaluated at the end; only the verdicts of the
+    /// last pass are written. Times are ignored in this case: at each location the last vote of
+    /// each vehicle in the recording counts.
     pub passes: Option<u32>,
 }
 
@@ -100,15 +105,15 @@ pub struct Summary {
     pub rejected: BTreeMap<RejectReason, Rejections>,
     /// Unit that the times seem to be in, if it is not microseconds, by the first readable line.
     pub unit: Option<TimeUnit>,
-    /// Used lines with a time before that of an earlier line.
+    /// Used lines with a time before the time of an earlier line.
     pub late: u64,
     /// Objects of used lines for VOTE.
     pub votes: u64,
-    /// Those of them that did not vote or whose votes were forgotten; see [`crate::vote`].
+    /// Objects that did not vote or whose votes were dropped; see [`crate::vote`].
     pub ignored_votes: u64,
     /// Lines of detections by the places of their objects.
     pub placements: Placements,
-    /// Lines that only tracking used, because a later one of their vehicle came before.
+    /// Lines that only tracking used, because a later report of their vehicle came first.
     pub overtaken: u64,
     /// Reports and objects that tracking did not use.
     pub tracks: TracksLosses,
@@ -127,8 +132,8 @@ impl Summary {
                 .sum::<u64>()
     }
 
-    /// Number of rejected lines, but for those of an algorithm that the cell does not run, and with `may_repeat` for those
-    /// that a vehicle sent again or before.
+    /// Number of rejected lines, except lines for an algorithm that the cell does not run and, with
+    /// `may_repeat`, reports that a vehicle repeated or sent out of order.
     pub fn faulty(&self, may_repeat: bool) -> u64 {
         let is_fault = |reason: RejectReason| match reason {
             RejectReason::NotFused => false,
@@ -148,7 +153,8 @@ impl Summary {
 pub struct Rejections {
     /// Their number.
     pub lines: u64,
-    /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones included.
+    /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones
+    /// included.
     pub examples: BTreeMap<u64, Flaw>,
 }
 
@@ -206,7 +212,8 @@ impl Replay {
         }
     }
 
-    /// Takes the next line, without its line end; returns the output that is ready. Blank lines are ignored.
+    /// Takes the next line, without its line end; returns the output that is ready. Blank lines are
+    /// ignored.
     pub fn line(&mut self, text: &[u8]) -> Vec<FusedLine> {
         self.number += 1;
         if text.trim_ascii().is_empty() {
@@ -244,8 +251,8 @@ impl Replay {
         self.reject(self.number, flaw::too_large(&self.config.limits));
     }
 
-    /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet of VOTE's `paper`
-    /// mode.
+    /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet
+    /// of VOTE's `paper` mode.
     pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
         let mut output = Vec::new();
         while !self.ahead.is_empty() {
@@ -323,7 +330,8 @@ impl Replay {
         if self.config.passes.is_some() {
             (line.report.captured_at_us, line.report.seq) = (now, number);
         }
-        // Objects are where their landmark is, but how far that is from the reporter only a known landmark can tell.
+        // Objects are at their landmark, but their distance from the reporter can only be derived
+        // from a configured landmark.
         if !line.is_placed && self.config.landmarks.is_empty() {
             line.report.pose = None;
         }
@@ -368,10 +376,11 @@ impl Replay {
         })
     }
 
-    /// Closes the rounds that were due before `now`; of a silence since `before`, only those at its beginning.
+    /// Closes the rounds that were due before `now`; of a silence since `before`, only the rounds
+    /// at its beginning.
     ///
-    /// A round without reports waits half a period longer for a line, and all lines of one time go into one round.
-    /// Otherwise rounds would cut recordings of the same period at arbitrary lines.
+    /// A round without reports waits half a period longer for a line, and all lines of one time go
+    /// into one round. Otherwise rounds would cut recordings of the same period at arbitrary lines.
     fn close_due_rounds(&mut self, before: Timestamp, now: Timestamp, output: &mut Vec<FusedLine>) {
         if now > before {
             self.close_first_round(before, output);
@@ -392,8 +401,9 @@ impl Replay {
         }
     }
 
-    /// Closes the round of the first time, if it is still open, at that time: no round before it was to end at a period's
-    /// end, and a recording whose period is that of the rounds has a map for its first frame too.
+    /// Closes the round of the first time, if it is still open, at that time. There is no earlier
+    /// round whose end could be waited for, and a recording with the same period as the rounds then
+    /// has a map for its first frame too.
     fn close_first_round(&mut self, at: Timestamp, output: &mut Vec<FusedLine>) {
         if self.pending && std::mem::take(&mut self.is_first_round) {
             let fused = self.cell.as_mut().and_then(|cell| cell.close_early(at));
@@ -408,7 +418,8 @@ impl Replay {
         self.write(fused, output);
     }
 
-    /// Writes a round. Algorithms without reports yet write nothing; with passes, only the last one writes.
+    /// Writes a round. Algorithms without reports so far are skipped; with passes, only the last
+    /// pass writes.
     fn write(&mut self, fused: Option<Fused>, output: &mut Vec<FusedLine>) {
         let Some(Fused { map, verdicts, .. }) = fused.filter(|_| self.config.passes.is_none())
         else {
@@ -427,8 +438,8 @@ impl Replay {
         self.summary.written += (output.len() - known) as u64;
     }
 
-    /// Learns the locations of an open cell: each is at the first object that names it. VOTE needs no positions and takes
-    /// locations itself.
+    /// Adds the locations of an open cell: each is at the first object that names it. VOTE needs no
+    /// positions and adds locations itself.
     fn learn_landmarks(&mut self, line: &RecordedReport) {
         if !self.config.landmarks.is_empty() || line.kind != ReportKind::Detections {
             return;
@@ -453,7 +464,7 @@ impl Replay {
 /// The report of a line and its kind, for programs that read a recording without replaying it.
 ///
 /// # Errors
-/// The flaw for which a replay would reject the line.
+/// Returns the flaw for which a replay would reject the line.
 pub fn read_report(text: &[u8], limits: &Limits) -> Result<(ReportKind, ObjectReport), Flaw> {
     RecordedReport::read(text, limits).map(|line| (line.kind, line.report))
 }

@@ -1,13 +1,16 @@
 //! Reputations: evidence about vehicles that aggregators merge without counting any vote twice.
 //!
-//! The ledger is a state-based grow-only counter (Shapiro et al. 2011). Every aggregator writes only the lane of its own
-//! epoch, and counts only grow. Merging takes the larger count in each lane: it is idempotent, commutative and
-//! associative. Two partitions that counted apart merge to the sum of their votes.
+//! The ledger is a state-based grow-only counter (Shapiro et al. 2011). Every aggregator writes
+//! only the lane of its own epoch, and counts only grow. Merging takes the larger count in each
+//! lane: it is idempotent, commutative and associative. Two partitions that counted separately
+//! merge to the sum of their votes.
 //!
-//! Marks let old votes be forgotten: a mark holds a vehicle's counts at an earlier number of votes. It is written once.
-//! The latest mark alone decides which marks are kept, so that merging them is a join too.
+//! Marks allow old votes to be dropped: a mark holds a vehicle's counts at an earlier number of
+//! votes. It is written once. The latest mark alone decides which marks are kept, so that merging
+//! them is a join too.
 //!
-//! Counts of other cells ([`ForeignReputations`]) are no part of the ledger: they move the score from which a vehicle starts.
+//! Counts of other cells ([`ForeignReputations`]) are not part of the ledger: they change a
+//! vehicle's initial score.
 
 mod foreign;
 mod ledger;
@@ -29,7 +32,7 @@ use crate::config::config_section;
 use crate::model::names::{Label, NodeName};
 use crate::wire::ForeignVotes;
 
-/// A settled vote: whether it agreed with the verdict is known and final.
+/// A settled vote: it is final whether the vote agreed with the verdict.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Evidence {
     /// The vehicle.
@@ -40,7 +43,7 @@ pub struct Evidence {
     pub correct: bool,
 }
 
-/// Numbers of votes that agreed with the verdict and that did not.
+/// Numbers of votes that agreed and disagreed with the verdict.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counts {
@@ -56,7 +59,7 @@ impl Counts {
         self.correct.saturating_add(self.incorrect)
     }
 
-    /// Share of votes that agreed, beside one of each kind.
+    /// Share of votes that agreed, after adding one vote of each kind.
     pub(crate) fn share(self) -> f64 {
         (self.correct as f64 + 1.0) / (self.total() as f64 + 2.0)
     }
@@ -94,31 +97,34 @@ impl Counts {
 config_section! {
     /// Settings of reputations.
     pub struct ReputationConfig {
-        /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. Below what a proven vehicle reaches.
+        /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. It should be below the score
+        /// of a proven vehicle.
         pub initial: f64 = 0.5, in 0.3 to 1.0;
-        /// Weight of the initial score in votes; default 10. More reacts later to newcomers and to new liars.
+        /// Weight of the initial score in votes; default 10. A higher value reacts later to
+        /// newcomers and to new false reports.
         pub initial_votes: f64 = 10.0, in 1e-3 to 1e6;
-        /// Number of the latest votes of a vehicle that count; default 500. Their beginning is interpolated between
-        /// marks. Less notices changed behaviour sooner.
+        /// Number of the latest votes of a vehicle that count; default 500. Their beginning is
+        /// interpolated between marks. A lower value notices changed behaviour sooner.
         pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
     }
 }
 
 impl ReputationConfig {
-    /// The reputation of a vehicle with these numbers of votes: the mean of a Beta distribution (Jøsang & Ismail 2002).
-    /// Unlike there, the prior is not uniform but [`Self::initial`] with the weight [`Self::initial_votes`].
+    /// The reputation of a vehicle with these numbers of votes: the mean of a Beta distribution
+    /// (Jøsang & Ismail 2002). Unlike there, the prior is not uniform but [`Self::initial`] with
+    /// the weight [`Self::initial_votes`].
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
         self.mean_with(correct, incorrect, ForeignVotes::default())
     }
 
-    /// The same of a vehicle of which other cells say something.
+    /// As [`Self::mean`], for a vehicle about which other cells have counts.
     pub fn mean_with(&self, correct: f64, incorrect: f64, foreign: ForeignVotes) -> f64 {
         let prior = self.initial * self.initial_votes + foreign.correct;
         (correct + prior) / (correct + incorrect + self.initial_votes + foreign.total())
     }
 }
 
-/// A vehicle's remembered votes, (correct, incorrect), by the label that it stated.
+/// A vehicle's kept votes, (correct, incorrect), by the label that it stated.
 pub type RememberedVotes = BTreeMap<Label, (f64, f64)>;
 
 #[cfg(test)]

@@ -1,12 +1,13 @@
-//! Cells that a vehicle drives through: in which of them it takes part, by its position.
+//! Roaming: selects the cell in which a vehicle is a member, by its position.
 //!
 //! ```text
 //! position ── observe ──> CellChoice ──> CellMove::Join    get ready in the next cell, and go on in the present one
 //!       the next follows ── enter ──┘└─> CellMove::GiveUp  stay in the present one
 //! ```
 //!
-//! A cell is a circle around its origin. A vehicle changes to a cell that it is in, and that is nearer than the present one by
-//! [`MARGIN_M`]. Distances are to the circles' edges, negative inside. Where circles overlap, the border is in the middle.
+//! A cell is a circle around its origin. A vehicle changes to a cell if it is inside that cell, and
+//! that cell is nearer than the current one by [`MARGIN_M`]. Distances are to the circles' edges,
+//! negative inside. Where circles overlap, the border is in the middle.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -15,40 +16,41 @@ use crate::model::names::NodeName;
 use crate::model::origin::{GeographicOrigin, GeographicPosition};
 use crate::model::time::Timestamp;
 
-/// Distance in metres by which the next cell must be nearer: more than localisation by satellites jumps on a road.
+/// Distance in metres by which the next cell must be nearer: more than localisation by satellites
+/// jumps on a road.
 pub const MARGIN_M: f64 = 20.0;
 
-/// Longest time in which a vehicle gets ready in the next cell.
+/// Maximum time for which a vehicle prepares in the next cell.
 pub const JOIN_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// Time for which a cell that could not be joined is not tried again.
 pub const RETRY_AFTER: Duration = Duration::from_secs(30);
 
-/// Time for which a cell is not tried again from which the vehicle has turned away.
+/// Time for which a cell is not tried again after the vehicle has turned away from it.
 pub const TURN_PAUSE: Duration = Duration::from_secs(5);
 
-/// A cell as a vehicle knows it.
+/// A cell in a vehicle's list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownCell {
     /// Its name.
     pub name: NodeName,
     /// Its middle.
     pub origin: GeographicOrigin,
-    /// Distance in metres from the middle up to which it reaches.
+    /// Radius of the cell in metres.
     pub radius_m: f64,
 }
 
 impl KnownCell {
-    /// Distance in metres to the edge on the ground, whatever the height; negative inside.
+    /// Horizontal distance in metres to the edge, independent of the height; negative inside.
     fn outside_m(&self, place: &GeographicPosition) -> f64 {
         self.origin.to_map(place).coords.xy().norm() - self.radius_m
     }
 }
 
-/// What a vehicle is to do.
+/// The next step of the vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CellMove {
-    /// Get ready in this cell, and go on in the present one until then.
+    /// Prepare in this cell, and stay in the present one until then.
     Join(NodeName),
     /// Leave this cell again, and stay in the present one.
     GiveUp(NodeName),
@@ -59,9 +61,9 @@ pub enum CellMove {
 pub struct CellChoice {
     cells: Vec<KnownCell>,
     present: NodeName,
-    /// The cell in which the vehicle gets ready, and since when.
+    /// The cell in which the vehicle prepares, and since when.
     next: Option<(NodeName, Timestamp)>,
-    /// Cells that could not be joined, and until when they are left alone.
+    /// Cells that could not be joined, and the time until which they are not tried.
     failed: BTreeMap<NodeName, Timestamp>,
 }
 
@@ -76,12 +78,13 @@ impl CellChoice {
         }
     }
 
-    /// The cell in which the vehicle takes part.
+    /// The cell in which the vehicle is a member.
     pub fn present(&self) -> &NodeName {
         &self.present
     }
 
-    /// Takes the vehicle's position at `now`, none if it is not known. The same again lets time pass.
+    /// Processes the vehicle's position at `now`, or `None` if it is unavailable. Repeated calls
+    /// with the same position let time pass.
     pub fn observe(
         &mut self,
         place: Option<&GeographicPosition>,
@@ -123,7 +126,8 @@ impl CellChoice {
         Some(CellMove::Join(name))
     }
 
-    /// Notes that the vehicle follows in the next cell; true if that is its cell from now on.
+    /// Records that the vehicle follows a leader in the next cell; returns true if this becomes its
+    /// cell.
     pub fn enter(&mut self, cell: &NodeName) -> bool {
         let Some((next, _)) = self.next.take_if(|(next, _)| next == cell) else {
             return false;
@@ -132,7 +136,7 @@ impl CellChoice {
         true
     }
 
-    /// Notes that a cell could not be joined: it is left alone for [`RETRY_AFTER`].
+    /// Records that a cell could not be joined: it is not tried again for [`RETRY_AFTER`].
     pub fn fail(&mut self, cell: &NodeName, now: Timestamp) {
         self.next.take_if(|(next, _)| next == cell);
         self.failed.insert(cell.clone(), now + RETRY_AFTER);
@@ -194,7 +198,8 @@ mod tests {
         Timestamp::default() + Duration::from_secs_f64(seconds)
     }
 
-    /// Drives at 50 km/h; each cell follows 2 s after it is joined. Places and cells of all changes.
+    /// Drives at 50 km/h; each cell follows 2 s after it is joined. Returns the places and cells of
+    /// all changes.
     fn drive(path: impl Fn(f64) -> (f64, f64), seconds: f64) -> Vec<(f64, NodeName)> {
         let mut choice = CellChoice::new(cells(), name(0));
         let (mut changes, mut joined) = (Vec::new(), None);

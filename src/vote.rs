@@ -1,16 +1,18 @@
-//! VOTE: the right label of a known location where vehicles disagree.
+//! VOTE: the right label of a landmark where vehicles disagree.
 //!
-//! [`Vote`] is a state machine without clocks. Call [`Vote::observe`] with every report and [`Vote::close`] at the end
-//! of a round. [`Vote::refine`] judges the stored votes again. Equal calls give equal results.
+//! [`Vote`] is a state machine without clocks. Call [`Vote::observe`] with every report and
+//! [`Vote::close`] at the end of a round. [`Vote::refine`] re-evaluates the stored votes. Equal
+//! calls give equal results.
 //!
-//! [`Vote::ignored`] counts the objects that do not vote, which is no error:
-//! - those without a landmark, or at a landmark that a closed cell does not know;
-//! - those of zero confidence or beyond the maximum range;
-//! - in `weighted` mode, all but the most confident object of a report at a landmark (the paper's sum takes them all);
-//! - votes for a label that made room for another.
+//! [`Vote::ignored`] counts the objects that do not vote, which is not an error:
+//! - objects without a landmark, or at a landmark that is missing in a closed cell;
+//! - objects of zero confidence or beyond the maximum range;
+//! - in `weighted` mode, all but the most confident object of a report at a landmark (the paper's
+//!   sum takes them all);
+//! - votes for a label that was evicted for another.
 //!
-//! A report is rejected if neither its `seq` nor its capture time is newer than the last of its vehicle, unless the
-//! vehicle's clock was set back.
+//! A report is rejected if neither its `seq` nor its capture time is newer than the last of its
+//! vehicle, unless the vehicle's clock was set back.
 
 mod calibration;
 mod config;
@@ -52,9 +54,10 @@ use method::NewVote;
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VoteRound {
-    /// One verdict for every landmark of a closed cell; in an open cell, for every landmark with news.
+    /// One verdict for every landmark of a closed cell; in an open cell, for every landmark with
+    /// news.
     pub verdicts: Vec<Verdict>,
-    /// Votes that are now known to be right or wrong, for the ledger.
+    /// Votes that have turned out to be right or wrong, for the ledger.
     pub evidence: Vec<Evidence>,
 }
 
@@ -62,18 +65,21 @@ pub struct VoteRound {
 #[derive(Debug, Clone)]
 struct LastReport {
     received_at: Timestamp,
-    /// The last report of each part, such as a camera: their reports overtake one another. At most [`MAX_PARTS`].
+    /// The last report of each part, such as a camera: their reports overtake one another. At most
+    /// [`MAX_PARTS`].
     parts: BTreeMap<NodeName, PartReport>,
-    /// Reports since the last verdict.
+    /// Number of reports since the last verdict.
     frames: u32,
 }
 
-/// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock was set back.
-/// [`crate::admission::report_window::ReportWindow`] admits reports for as long by default.
+/// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock
+/// was set back. [`crate::admission::report_window::ReportWindow`] admits reports for as long by
+/// default.
 const MAX_OVERTAKEN: Duration = Duration::from_secs(3);
-/// Silence after which a vehicle may be forgotten for another: unproven vehicles, proven vehicles.
+/// Silence after which a vehicle may be replaced by another: unproven vehicles, proven vehicles.
 const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];
-/// Inverse share of the vehicles that is forgotten at once, so that the cost per newcomer stays small.
+/// Inverse share of the vehicles that is evicted at once, so that the cost per newcomer stays
+/// small.
 const EVICTION_DIVISOR: usize = 8;
 
 /// The last report of a part of a vehicle, or of the vehicle itself.
@@ -84,8 +90,9 @@ struct PartReport {
 }
 
 impl PartReport {
-    /// Whether `report` was made later. A restarted node counts `seq` from the start again, but its time goes on. A
-    /// corrected clock may go back, but `seq` goes on. If both happen, only the size of the step tells.
+    /// Whether `report` was made later. A restarted node counts `seq` from the start again, but its
+    /// time continues. A corrected clock may go back, but `seq` continues. If both happen, only the
+    /// size of the step distinguishes them.
     fn is_before(&self, report: &ObjectReport) -> bool {
         report.captured_at_us > self.captured_at
             || report.seq > self.seq
@@ -104,13 +111,14 @@ pub struct Vote {
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
-    /// Vacancy signs that were read lately, and when, by vehicle.
+    /// Vacancy signs that were recently read, with the time, by vehicle.
     signs: BTreeMap<LandmarkId, BTreeMap<NodeName, Timestamp>>,
     ignored: u64,
 }
 
 impl Vote {
-    /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the reports as they appear.
+    /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the
+    /// reports as they appear.
     pub fn new(config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
         let mut method = ConfiguredMethod::new(&config);
         for landmark in &landmarks {
@@ -131,7 +139,8 @@ impl Vote {
         }
     }
 
-    /// The same votes and trust under other settings and for other landmarks. Another mode starts without votes.
+    /// The same votes and reputations under other settings and for other landmarks. A different
+    /// mode starts without votes.
     #[must_use]
     pub(crate) fn configured(mut self, config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
         if config.mode != self.config.mode {
@@ -167,7 +176,8 @@ impl Vote {
         }
     }
 
-    /// True if a location of this id is listed; `None` without a list, where reports name the locations.
+    /// True if a location of this id is listed; `None` without a list, where reports name the
+    /// locations.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
         (!self.open).then(|| self.landmarks.contains_key(id))
     }
@@ -175,7 +185,7 @@ impl Vote {
     /// Counts the votes of a report that was received at `received_at`.
     ///
     /// # Errors
-    /// The reason why the report was not used; nothing has changed then.
+    /// Returns the reason why the report was not used. The state is unchanged in this case.
     pub fn observe(
         &mut self,
         report: &ObjectReport,
@@ -184,10 +194,10 @@ impl Vote {
         self.observe_part(report, &report.node, received_at)
     }
 
-    /// The same for a report that a part of its vehicle made.
+    /// As [`Self::observe`], for a report made by a part of the vehicle.
     ///
     /// # Errors
-    /// As for [`Self::observe`].
+    /// Returns the errors of [`Self::observe`].
     pub fn observe_part(
         &mut self,
         report: &ObjectReport,
@@ -241,8 +251,9 @@ impl Vote {
         Ok(())
     }
 
-    /// Makes room for a vehicle: forgets silent ones if the maximum is reached. Unproven vehicles and those that were
-    /// mostly wrong go before proven ones, the longest silent first.
+    /// Makes room for a vehicle: evicts silent vehicles if the maximum is reached. Unproven
+    /// vehicles and vehicles that were mostly wrong are evicted before proven ones, the longest
+    /// silent first.
     fn evict_silent_vehicles(&mut self, now: Timestamp) -> Result<(), RejectReason> {
         if self.last_reports.len() < self.config.max_vehicles {
             return Ok(());
@@ -268,8 +279,8 @@ impl Vote {
         Ok(())
     }
 
-    /// The most confident object at each landmark, the first on a tie, by landmark; its vacancy sign only if nothing is
-    /// before it.
+    /// The most confident object at each landmark (the first on a tie), by landmark. The landmark's
+    /// vacancy sign counts only if there is no object in front of it.
     fn one_per_landmark<'a>(&mut self, objects: &'a [PerceivedObject]) -> Vec<&'a PerceivedObject> {
         let mut best: BTreeMap<Option<&LandmarkId>, &PerceivedObject> = BTreeMap::new();
         for object in objects {
@@ -297,7 +308,7 @@ impl Vote {
         best.into_values().collect()
     }
 
-    /// Counts one object as a vote; false if it does not count as one.
+    /// Counts one object as a vote; returns false if it is not a vote.
     fn add_vote(
         &mut self,
         report: &ObjectReport,
@@ -350,7 +361,7 @@ impl Vote {
         true
     }
 
-    /// The label that a stated one counts as.
+    /// The label as which a stated label counts.
     fn voted_label<'a>(&'a self, landmark: Option<&'a Landmark>, stated: &'a Label) -> &'a Label {
         let synonym = landmark.and_then(|landmark| landmark.synonym(stated));
         synonym
@@ -358,14 +369,15 @@ impl Vote {
             .unwrap_or(stated)
     }
 
-    /// True if a voted label is that of the landmark's vacancy sign.
+    /// True if a voted label is the label of the landmark's vacancy sign.
     fn is_sign(&self, landmark: Option<&Landmark>, voted: &Label) -> bool {
         let sign = landmark.and_then(|landmark| landmark.vacancy.as_ref());
         sign.is_some_and(|sign| self.voted_label(landmark, &sign.label) == voted)
     }
 
-    /// Notes that a vehicle read a landmark's vacancy sign. True if it is behind an object, and no vote against that: at
-    /// least as many other vehicles read an object there as read the sign. Those do not count that were mostly wrong.
+    /// Records that a vehicle read a landmark's vacancy sign. Returns true if the sign is behind an
+    /// object, so that reading it is not a vote against the object: at least as many other vehicles
+    /// read an object there as read the sign. Vehicles that were mostly wrong are not counted.
     fn is_behind_object(
         &mut self,
         landmark: &LandmarkId,
@@ -388,7 +400,8 @@ impl Vote {
         objects > 0 && objects >= signs.len()
     }
 
-    /// Labels that vehicles read at a landmark lately, those that are no votes included, and which vehicles.
+    /// Labels that vehicles recently read at a landmark, including labels that are not votes, and
+    /// the vehicles.
     pub fn readings(&self, landmark: &LandmarkId, now: Timestamp) -> Vec<LabelReading> {
         let mut readings = self.method.get().readings(landmark);
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
@@ -427,7 +440,7 @@ impl Vote {
         self.landmarks.insert(landmark.clone(), None);
     }
 
-    /// Whether a vehicle has sent a packet's worth of frames since the last verdict (`paper` mode).
+    /// Whether a vehicle has sent a full packet of frames since the last verdict (`paper` mode).
     pub fn is_packet_complete(&self) -> bool {
         self.last_reports
             .values()
@@ -439,7 +452,7 @@ impl Vote {
         self.last_reports.values().any(|last| last.frames > 0)
     }
 
-    /// Ends the round: judges the landmarks that changed.
+    /// Ends the round: evaluates the landmarks that changed.
     pub fn close(&mut self, now: Timestamp) -> VoteRound {
         self.last_reports
             .values_mut()
@@ -456,8 +469,8 @@ impl Vote {
         VoteRound { verdicts, evidence }
     }
 
-    /// Begins a leadership: earlier votes go on deciding verdicts but yield no evidence, because the previous leader
-    /// settles them.
+    /// Begins a leadership: earlier votes still contribute to verdicts but yield no evidence,
+    /// because the previous leader settles them.
     pub(crate) fn begin_record(&mut self, now: Timestamp) {
         self.method.get_mut().begin_record(now);
     }
@@ -470,39 +483,41 @@ impl Vote {
             .collect()
     }
 
-    /// Judges the stored votes `passes` times, starting from equal trust; returns the verdict of every landmark.
+    /// Re-evaluates the stored votes `passes` times, starting from equal trust; returns the verdict
+    /// of every landmark.
     ///
-    /// This is Dawid & Skene (1979) with the priors of the online machine. It does not depend on the order of arrival.
-    /// Without effect in `paper` mode.
+    /// This is Dawid & Skene (1979) with the priors of the online machine. It does not depend on
+    /// the order of arrival. It has no effect in `paper` mode.
     pub fn refine(&mut self, passes: u32) -> Vec<Verdict> {
         self.method.get_mut().refine(passes);
         self.verdicts()
     }
 
-    /// The trust in each vehicle.
+    /// The reputation of each vehicle.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.method.get().reputations()
     }
 
-    /// Starts from a ledger, after a restart or a change of aggregator; without effect in `paper` mode.
+    /// Starts from a ledger, after a restart or a change of aggregator; has no effect in `paper`
+    /// mode.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.method.get_mut().adopt(ledger, &self.config);
     }
 
-    /// Takes the votes of other cells, by the weight in votes of the prior beside which they count; without effect in
+    /// Sets the votes of other cells, given the weight of the prior in votes; has no effect in
     /// `paper` mode.
     pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
         self.method.get_mut().set_foreign(&votes_beside);
     }
 
-    /// Continues from published reputations, after a restart or a change of aggregator; without effect in `weighted`
-    /// mode, which rests on evidence.
+    /// Continues from published reputations, after a restart or a change of aggregator; has no
+    /// effect in `weighted` mode, which uses evidence instead.
     pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         self.method.get_mut().resume(reputations);
     }
 
-    /// Number of objects so far that did not vote or whose votes were forgotten with their labels; see the module's
-    /// documentation.
+    /// Number of objects so far that did not vote or whose votes were dropped with their labels;
+    /// see the module's documentation.
     pub fn ignored(&self) -> u64 {
         self.ignored
     }

@@ -14,9 +14,11 @@
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
-//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`], [`ReputationTopic`]).
+//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`],
+//! [`ReputationTopic`]).
 //!
-//! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
+//! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU
+//! frame.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -69,7 +71,7 @@ use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
-/// Major version of every payload; others are rejected.
+/// Major version of every payload; payloads of other versions are rejected.
 pub const SCHEMA_VERSION: u32 = 1;
 
 /// The detections of one vehicle in one frame.
@@ -81,13 +83,14 @@ pub struct ObjectReport {
     /// The reporting node; equals the last level of the topic.
     #[n(1)]
     pub node: NodeName,
-    /// Counts up by one with every report of a node since it started.
+    /// Increases by one with every report of a node since it started.
     #[n(2)]
     pub seq: u64,
-    /// Capture time of the frame: in the cell's time with `clock_error_us`, otherwise by the sender's own clock.
+    /// Capture time of the frame: in the cell's time if `clock_error_us` is present, otherwise by
+    /// the sender's own clock.
     #[n(3)]
     pub captured_at_us: Timestamp,
-    /// Pose of the camera; absent when it is not known.
+    /// Pose of the camera; absent if it is unavailable.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub pose: Option<WirePose>,
@@ -98,20 +101,23 @@ pub struct ObjectReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(6), with = "Text", has_nil)]
     pub seen: Option<Vec<LandmarkId>>,
-    /// The field of view from the pose; without it, the aggregator learns from the detections where a miss counts.
+    /// The field of view from the pose; without it, the aggregator derives from the detections
+    /// where a miss counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub view: Option<FieldOfView>,
-    /// Largest error in microseconds of the sender's estimate of the cell's time; absent when it has none.
+    /// Maximum error in microseconds of the sender's estimate of the cell's time; absent without an
+    /// estimate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(8)]
     pub clock_error_us: Option<u32>,
-    /// Yaw rate in radians per second, counter-clockwise, of a frame of positions that turns, as one that is fixed to a
-    /// vehicle does; absent in a frame that does not turn.
+    /// Yaw rate in radians per second, counter-clockwise, of a rotating frame of positions, such as
+    /// a frame fixed to a vehicle; absent in a frame that does not rotate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(9), with = "Single", has_nil)]
     pub frame_yaw_rate_radps: Option<f64>,
-    /// False if the reporter is a fixed camera, which is no object of the map; absent for a vehicle.
+    /// False if the reporter is a fixed camera, which is not an object of the map; absent for a
+    /// vehicle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(10)]
     pub moving: Option<bool>,
@@ -148,22 +154,22 @@ pub struct WirePose {
     /// Direction of the camera's axis in radians, counter-clockwise from east.
     #[cbor(n(2), with = "Single")]
     pub heading_rad: f64,
-    /// Height of the camera above the ground in metres; absent when it is not known.
+    /// Height of the camera above the ground in metres; absent if it is not configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(3), with = "Millimetres", has_nil)]
     pub height_m: Option<f64>,
-    /// Angle of the camera's axis below the horizon in radians; absent when it is not known.
+    /// Angle of the camera's axis below the horizon in radians; absent if it is not configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(4), with = "Single", has_nil)]
     pub pitch_rad: Option<f64>,
-    /// Angle in radians by which the camera leans to its right; absent when it is not known.
+    /// Angle in radians by which the camera leans to its right; absent if it is not configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(5), with = "Single", has_nil)]
     pub roll_rad: Option<f64>,
 }
 
 impl WirePose {
-    /// A pose in the plane, in metres and radians; nothing else is known.
+    /// A pose in the plane, in metres and radians; all other fields are absent.
     pub fn new(x_m: f64, y_m: f64, heading_rad: f64) -> Self {
         Self {
             x_m,
@@ -200,34 +206,35 @@ pub struct GlobalMap {
     /// Term of the leadership that fused it.
     #[n(2)]
     pub epoch: u64,
-    /// Counts up by one with every round of an epoch.
+    /// Increases by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
     /// Time when the round closed, in the cell's time.
     #[n(4)]
     pub fused_at_us: Timestamp,
-    /// Capture time, in the cell's time, of the oldest report in the map; absent when it rests on none.
+    /// Capture time, in the cell's time, of the oldest report used in the map; absent without
+    /// reports.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub oldest_capture_us: Option<Timestamp>,
-    /// One entry per known location, in configuration order.
+    /// One entry per landmark, in configuration order.
     #[n(6)]
     pub landmarks: Vec<LandmarkState>,
-    /// Objects that matched no known location.
+    /// Objects that matched no landmark.
     #[n(7)]
     pub objects: Vec<FusedObject>,
     /// Corrections of each vehicle's positions before fusion, by vehicle.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cbor(n(8), with = "skip_empty", has_nil)]
     pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
-    /// Objects of neighbouring cells, near this one. They are none of this cell's objects.
+    /// Objects of neighbouring cells near this cell. They are not this cell's own objects.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(9), with = "skip_empty", has_nil)]
     pub neighbour_objects: Vec<NeighbourObject>,
 }
 
 impl GlobalMap {
-    /// An empty map of a leadership's round that closed at `fused_at`.
+    /// An empty map of a round of a leadership that closed at `fused_at`.
     pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -244,39 +251,39 @@ impl GlobalMap {
     }
 }
 
-/// The agreed state of one known location.
+/// The agreed state of one landmark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LandmarkState {
     /// The location.
     #[cbor(n(0), with = "Text")]
     pub id: LandmarkId,
-    /// The agreed label, or null when nothing was detected there.
+    /// The agreed label, or null without a detection.
     #[cbor(n(1), with = "Text", has_nil)]
     pub label: Option<Label>,
     /// Confidence in the label, 0 to 1; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub confidence: f64,
-    /// Fused east in metres, or the location's own.
+    /// Fused east in metres, or the location's own coordinate.
     #[cbor(n(3), with = "Millimetres")]
     pub x_m: f64,
-    /// Fused north in metres, or the location's own.
+    /// Fused north in metres, or the location's own coordinate.
     #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
-    /// The nodes whose detections are in the entry.
+    /// The nodes whose detections were used for the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
-    /// The nodes that had the location in view, with or without a detection. A null label with observers means that the
-    /// location is empty; without observers it is unknown.
+    /// The nodes that had the location in view, with or without a detection. A null label with
+    /// observers means that the location is empty; without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
-    /// Labels that nodes read at the location lately, and which nodes; in a cell that votes, too.
+    /// Labels that nodes recently read at the location, with the nodes; also in a cell that votes.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(7), with = "skip_empty", has_nil)]
     pub readings: Vec<LabelReading>,
 }
 
-/// Nodes that read a label at a known location.
+/// Nodes that read a label at a landmark.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LabelReading {
     /// The label.
@@ -299,19 +306,19 @@ pub struct Verdicts {
     /// Term of the leadership that counted them.
     #[n(2)]
     pub epoch: u64,
-    /// Counts up by one with every round of an epoch.
+    /// Increases by one with every round of an epoch.
     #[n(3)]
     pub round: u64,
     /// Time when the round closed, in the cell's time.
     #[n(4)]
     pub fused_at_us: Timestamp,
-    /// One entry per known location.
+    /// One entry per landmark.
     #[n(5)]
     pub verdicts: Vec<Verdict>,
 }
 
 impl Verdicts {
-    /// The verdicts of a leadership's round that closed at `fused_at`.
+    /// The verdicts of a round of a leadership that closed at `fused_at`.
     pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp, verdicts: Vec<Verdict>) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -324,7 +331,7 @@ impl Verdicts {
     }
 }
 
-/// The agreed label of one known location.
+/// The agreed label of one landmark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Verdict {
     /// The location.
@@ -336,18 +343,19 @@ pub struct Verdict {
     /// Score of the label; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub score: f64,
-    /// Lead of the label's score over that of the next best; 0 while hysteresis keeps a label that does not lead.
+    /// Lead of the label's score over the score of the next best label; 0 while hysteresis keeps a
+    /// label that does not lead.
     #[cbor(n(3), with = "Half")]
     pub margin: f64,
-    /// Score of every label that was voted for.
+    /// Score of every label with votes.
     #[cbor(n(4), with = "Half", has_nil)]
     pub votes: BTreeMap<Label, f64>,
-    /// The nodes whose votes are in the entry.
+    /// The nodes whose votes were used for the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
 }
 
-/// The trust in each vehicle.
+/// The reputation of each vehicle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputations {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -363,12 +371,12 @@ pub struct Reputations {
     /// The last round in the reputations.
     #[n(3)]
     pub round: u64,
-    /// One entry per known vehicle.
+    /// One entry per vehicle.
     #[n(4)]
     pub reputations: BTreeMap<NodeName, Reputation>,
 }
 
-/// The trust in one vehicle and its evidence.
+/// The reputation of one vehicle and its evidence.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Reputation {
     /// Weight of the vehicle's votes, 0.30 to 1.00.
@@ -377,16 +385,17 @@ pub struct Reputation {
     /// Number of votes that agreed with the verdict.
     #[n(1)]
     pub correct: u64,
-    /// Number of votes that did not.
+    /// Number of votes that disagreed with the verdict.
     #[n(2)]
     pub incorrect: u64,
-    /// What other cells say, as far as it is in the score; absent if they say nothing.
+    /// Counts of other cells, as far as they are included in the score; absent without such counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(3)]
     pub foreign: Option<ForeignVotes>,
 }
 
-/// A node's status, published by itself; the broker publishes the last will when the node goes silent.
+/// A node's status, published by itself; the broker publishes the last will when the node goes
+/// silent.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NodeStatus {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -411,30 +420,31 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(6)]
     pub aggregator: Option<NodeName>,
-    /// True if its broker, fuser and gateway work, so that it could lead; absent on a node that never leads.
+    /// True if the node's broker, fuser and gateway work, so that it could lead; absent on a node
+    /// that cannot lead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub fit: Option<bool>,
     /// Version of the software.
     #[n(8)]
     pub version: String,
-    /// The description of the cell that it knows; absent without one.
+    /// The node's description of the cell; absent without one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub description: Option<DescriptionStatus>,
-    /// Present troubles of the node, and of vehicles as the node sees them.
+    /// Current troubles of the node, and of vehicles as observed by the node.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(10), with = "skip_empty", has_nil)]
     pub troubles: Vec<Trouble>,
-    /// Address and port at which the node serves its page; absent without one. An unspecified address stands for all of
-    /// the node's own.
+    /// Address and port at which the node serves its page; absent without one. An unspecified
+    /// address represents all of the node's own addresses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(11)]
     pub page: Option<String>,
 }
 
 impl NodeStatus {
-    /// The status of a node that has just started and follows no aggregator yet.
+    /// The status of a node that has just started and does not follow an aggregator yet.
     pub fn starting(node: NodeName, id: Uuid, role: Role, version: &str) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -463,22 +473,22 @@ pub enum Role {
     /// Aggregates if no better candidate is alive, otherwise follows.
     #[n(0)]
     Auto,
-    /// Never aggregates.
+    /// Cannot become aggregator.
     #[n(1)]
     Cav,
-    /// Always the preferred aggregator, has no camera.
+    /// Always the preferred aggregator; has no camera.
     #[n(2)]
     Edge,
 }
 
-/// The present state of a node.
+/// The current state of a node.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
 pub enum NodeState {
-    /// Takes maps and verdicts from an aggregator.
+    /// Receives maps and verdicts from an aggregator.
     #[n(0)]
     Following,
     /// Makes maps and verdicts.

@@ -1,4 +1,4 @@
-//! The actors of a node: each carries out what the core decides.
+//! The actors of a node, which carry out the decisions of the core crate.
 
 pub mod broker;
 pub mod dashboard;

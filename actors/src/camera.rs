@@ -1,4 +1,5 @@
-//! Camera of a vehicle: frame sources, detectors, lens, calibration, and placing detections in the world.
+//! Camera of a vehicle: frame sources, detectors, lens, calibration, and placing detections in the
+//! world.
 
 #[cfg(feature = "camera")]
 pub mod calibrate;

@@ -1,4 +1,4 @@
-//! Command line of `ecod-node`, with the parts that `ecod-lab` shares.
+//! Command line of `ecod-node`, including the parts that `ecod-lab` shares.
 
 #[cfg(feature = "camera")]
 mod calibrate;
@@ -55,7 +55,8 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Try it on your own video, images or camera: starts a cell with a page, without a configuration
+    /// Try it on your own video, images or camera: starts a cell with a page, without a
+    /// configuration
     #[cfg(feature = "camera")]
     Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
@@ -64,7 +65,7 @@ enum Command {
     Top(top::TopArguments),
     /// Join a cell as an observer and record all its messages (MCAP)
     Record(record::RecordArguments),
-    /// Make maps and verdicts of a recording again; equal input gives equal output
+    /// Recompute maps and verdicts of a recording; equal input gives equal output
     Replay(replay::ReplayArguments),
     /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),
@@ -83,7 +84,8 @@ enum Command {
     /// The settings that all nodes of a cell share: set, show, compare
     #[command(subcommand)]
     Cell(cell::CellCommand),
-    /// Forget the evidence behind the reputations, the highest term, or the cell's description, of a node that is stopped
+    /// Drop the evidence behind the reputations, the highest term, or the cell's description, of a
+    /// node that is stopped
     Reset(reset::ResetArguments),
     /// Print the JSON Schemas of every message
     Schema,
@@ -112,10 +114,10 @@ pub struct Failure {
 /// Exit code for an unusable configuration or argument.
 const USAGE: u8 = 2;
 
-/// Exit code of a node whose name is another's.
+/// Exit code of a node whose name is already in use.
 const NAME_TAKEN: u8 = 4;
 
-/// Exit code for input of which nothing, or too little, could be used.
+/// Exit code for input that is unusable or almost unusable.
 const REJECTED: u8 = 3;
 
 /// Runs the program with the process's arguments.
@@ -123,7 +125,7 @@ pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
 }
 
-/// The exit code of `program`; a failure is told of on standard error.
+/// The exit code of `program`; a failure is printed on standard error.
 pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -134,7 +136,7 @@ pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     }
 }
 
-/// The process's arguments; ends the process on those that no program of the project has.
+/// The process's arguments; ends the process if they are invalid for every program of the project.
 fn parse() -> Result<Cli, Failure> {
     Cli::try_parse().map_err(|error| {
         let command = match error.get(ContextKind::InvalidSubcommand) {
@@ -146,7 +148,7 @@ fn parse() -> Result<Cli, Failure> {
     })
 }
 
-/// Names the command of another program, and how to get that.
+/// Names the command of another program, and how to install that program.
 fn elsewhere(instead: &str) -> Failure {
     let program = instead.split(' ').next().unwrap_or_default();
     let build =
@@ -164,10 +166,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
-        // Nothing of a trial is to outlive it.
+        // A trial keeps no state.
         #[cfg(feature = "camera")]
         Some(Command::Try(_)) => "warn,ecod_actors::actors::reputation_keeper=error",
-        // The command tells of refusals itself.
+        // The command reports refusals itself.
         Some(Command::Cell(_)) => "warn,rumqttc=off",
         _ => "warn",
     };
@@ -195,10 +197,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     }
 }
 
-/// Writes to standard output. A reader that closes it early, such as `head`, is no failure.
+/// Writes to standard output. A reader that closes it early, such as `head`, is not a failure.
 ///
 /// # Errors
-/// When it cannot be written.
+/// Returns an error if standard output cannot be written.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
     match output
@@ -217,7 +219,7 @@ impl From<anyhow::Error> for Failure {
 }
 
 impl Failure {
-    /// A node whose name is another's.
+    /// A node whose name is already in use.
     fn name_taken(error: anyhow::Error) -> Self {
         Self {
             error,
@@ -233,7 +235,7 @@ impl Failure {
         }
     }
 
-    /// Input of which nothing, or too little, could be used.
+    /// Input that is unusable or almost unusable.
     fn rejected(error: anyhow::Error) -> Self {
         Self {
             error,

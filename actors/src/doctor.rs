@@ -1,7 +1,8 @@
-//! Checks of what a node needs from its machine.
+//! Checks of the machine for everything that a node needs.
 //!
-//! The checks change nothing: they close the ports that they open, remove the files that they create, disconnect from the
-//! broker, and leave the cell in which they look on for some seconds. While the node itself runs, its ports are reported as in use.
+//! The checks leave the machine unchanged: they close the ports that they open, remove the files
+//! that they create, disconnect from the broker, and leave the cell, which they observe for some
+//! seconds. While the node itself runs, its ports are reported as in use.
 
 #[cfg(feature = "camera")]
 mod camera;
@@ -317,7 +318,7 @@ mod tests {
             listen: None,
             ..cav.clone()
         };
-        // Somebody has it: this test or another.
+        // The port is in use, by this test or by another.
         let _taken = TcpListener::bind(unset.broker_listen());
         let found = finding(&unset, "broker port").await;
         assert!(found.verdict == CheckResult::Doubtful && found.fix.unwrap().contains("`listen`"));
@@ -347,7 +348,7 @@ mod tests {
     #[tokio::test]
     async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for()
      {
-        // Somebody has it: this test or another.
+        // The port is in use, by this test or by another.
         let _taken = TcpListener::bind(crate::observe::dashboard::DEFAULT_ADDRESS);
         let mut config = config();
         config.dashboard.enabled = true;
@@ -592,7 +593,8 @@ mod tests {
         edge.stop().await;
     }
 
-    /// A log may be written by whoever tries, and not by the service, whose unit protects the system from it.
+    /// A log may be written by any user who tries, but not by the service, whose unit restricts its
+    /// paths.
     #[tokio::test]
     async fn what_the_unit_does_not_let_the_service_write_is_doubtful() {
         let unit = include_str!("../../packaging/systemd/ecod-node.service");

@@ -1,4 +1,4 @@
-//! What the actors of a node say to each other, and where each is reached. Imports no actor.
+//! The messages between the actors of a node, and the actors' addresses. Imports no actor.
 
 pub mod actor_slot;
 pub mod broker;

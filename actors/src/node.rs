@@ -18,8 +18,9 @@
 //! └─ PoseReceiver      where the vehicle is               if it moves
 //! ```
 //!
-//! A part that ends is started anew, and the others go on: they reach each other through slots. A node whose parts end
-//! more often than [`MAX_RESTARTS`] times in [`RESTART_SPAN`] gives up, so that the service manager starts it afresh.
+//! A part that ends is restarted while the other parts continue: they address each other through
+//! slots. A node whose parts end more often than [`MAX_RESTARTS`] times in [`RESTART_SPAN`] gives
+//! up, so that the service manager starts it afresh.
 
 mod builder;
 #[cfg(feature = "camera")]
@@ -69,9 +70,9 @@ use restarts::Restarts;
 /// Messages to the supervisor; it stops by [`NodeHandle::stop`].
 #[derive(Debug)]
 pub enum NodeMessage {
-    /// Log how the node is.
+    /// Log the state of the node.
     LogHealth,
-    /// Tell the service manager from now on how the node is.
+    /// Report the state of the node to the service manager from now on.
     ReportTo {
         /// The manager.
         manager: ServiceManager,
@@ -81,21 +82,21 @@ pub enum NodeMessage {
         /// The description.
         description: Arc<CellDescription>,
     },
-    /// This is how the node is.
+    /// Record the readiness of the node.
     NoteReadiness {
         /// Readiness for its task.
         readiness: Readiness,
     },
-    /// Change what this node does for the vehicle, which moves from cell to cell.
+    /// Change the functions of this node for the vehicle, which moves from cell to cell.
     Move {
         /// The change.
         step: MoveStep,
-        /// Gets word when it is done.
+        /// Answered when the change is done.
         done: RpcReplyPort<()>,
     },
 }
 
-/// Starts the parts of a node and starts them again.
+/// Starts and restarts the parts of a node.
 #[derive(Debug, Default)]
 struct Supervisor;
 
@@ -113,7 +114,7 @@ pub enum NodeError {
     /// A part did not start, or the node gave up on one.
     #[error("{0}")]
     Failed(String),
-    /// Another node has the name, and the cell takes that one's word.
+    /// Another node has the name, and the cell accepts that node's messages.
     #[error(
         "another running node of the cell {cell} is called {name}: give one of them another name, or stop that one"
     )]
@@ -147,13 +148,14 @@ pub struct NodeHandle {
 /// Time between two log lines about a node's health.
 const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 
-/// A node that starts. Boxed, it is compiled once, and not again in every program that starts a node.
+/// A node that starts. Boxed, so that it is compiled once and not in every program that starts a
+/// node.
 pub type Starting = Pin<Box<dyn Future<Output = Result<NodeHandle, NodeError>> + Send>>;
 
 /// Starts a node; `config` is taken as valid.
 ///
 /// # Errors
-/// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
+/// Returns a [`NodeError`] if a part cannot start, such as when the broker's port is busy.
 pub fn start(config: NodeConfig) -> Starting {
     Box::pin(async move {
         let vehicle = VehicleParts::new(&config);
@@ -161,7 +163,7 @@ pub fn start(config: NodeConfig) -> Starting {
     })
 }
 
-/// Starts a node of a vehicle as far as its presence goes.
+/// Starts a node of a vehicle up to its presence.
 async fn start_with(
     vehicle: (VehicleParts, Presence),
     config: NodeConfig,
@@ -238,12 +240,13 @@ impl NodeHandle {
         *self.listens_at.borrow()
     }
 
-    /// Where the embedded broker listens for other nodes, if the node has one that may carry the cell.
+    /// Address at which the embedded broker listens for other nodes, if the node has a broker that
+    /// may carry the cell's data.
     pub fn broker_address(&self) -> Option<SocketAddr> {
         *self.broker.borrow()
     }
 
-    /// Where the node gossips; the address may be unspecified.
+    /// Address at which the node gossips; it may be unspecified.
     pub fn gossip_address(&self) -> Option<SocketAddr> {
         *self.gossip.borrow()
     }
@@ -273,7 +276,7 @@ impl NodeHandle {
         &self.counters
     }
 
-    /// Present troubles of the cell: those of this node, and those that others tell in their statuses.
+    /// Current troubles of the cell: troubles of this node, and troubles in other nodes' statuses.
     pub fn troubles(&self) -> Vec<(Option<NodeName>, Trouble)> {
         let leader = self.leadership().borrow().leader().cloned();
         self.live_state.troubles(
@@ -283,16 +286,17 @@ impl NodeHandle {
         )
     }
 
-    /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.
+    /// Makes the supervisor report the node's state to a service manager until it ends.
     pub fn report_to(&self, manager: ServiceManager) {
-        // A supervisor that has ended is noticed by `failed`.
+        // `failed` detects a supervisor that has ended.
         let _ = self.supervisor.cast(NodeMessage::ReportTo { manager });
     }
 
     /// Waits until the node has given up.
     ///
     /// # Errors
-    /// [`NodeError`] always says why; the node never ends well by itself.
+    /// Always returns a [`NodeError`] with the reason, because a node does not end successfully by
+    /// itself.
     pub async fn failed(&mut self) -> Result<(), NodeError> {
         let why = self
             .failure
@@ -353,16 +357,16 @@ impl Actor for Supervisor {
             }
             NodeMessage::Describe { description } => {
                 state.builder.describe(&description);
-                // Settings may want a part that there was no use for.
+                // The settings may require a part that was not needed before.
                 state.start_missing(&myself.get_cell()).await?;
             }
             NodeMessage::Move { step, done } => {
                 state.take_step(step, &myself.get_cell()).await?;
-                // A caller that has stopped waiting needs no word.
+                // A caller that has stopped waiting needs no answer.
                 let _ = done.send(());
             }
             NodeMessage::NoteReadiness { mut readiness } => {
-                // Between two cells there is no leader, and a start anew would begin at home.
+                // Between two cells there is no leader, and a restart would begin in the home cell.
                 readiness.needs_restart &= !state.builder.moves_on();
                 if let Some(manager) = &mut state.manager {
                     manager.beat(readiness);
@@ -380,7 +384,8 @@ impl Actor for Supervisor {
     ) -> Result<(), ActorProcessingErr> {
         let (actor, why) = match event {
             SupervisionEvent::ActorTerminated(actor, last, why) => {
-                // A killed part lives on in its state, such as the broker with its port; ending it may take a while.
+                // A killed part lives on in its state, such as the broker with its port; ending it
+                // may take a while.
                 tokio::task::spawn_blocking(|| drop(last));
                 (actor, why.unwrap_or_else(|| "stopped".into()))
             }
@@ -435,8 +440,8 @@ impl SupervisorState {
     }
 }
 
-/// Asks the parts again and again, and tells the supervisor: what hangs, be it part or supervisor, is not passed off as
-/// well. Ends with the supervisor.
+/// Queries the parts periodically and reports to the supervisor. If a part or the supervisor hangs,
+/// the node does not count as ready. Ends with the supervisor.
 async fn watch_readiness(vitals: Vitals, period: Duration, supervisor: ActorRef<NodeMessage>) {
     let mut ticks = tokio::time::interval(period);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);

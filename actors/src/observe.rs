@@ -1,4 +1,4 @@
-//! What people and programs see of a node: page, metrics, health, logs, reports.
+//! The views of a node for people and programs: page, metrics, health, logs, reports.
 
 pub mod dashboard;
 pub mod http;

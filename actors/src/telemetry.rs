@@ -1,4 +1,4 @@
-//! Counters of a node, and spans of what it does.
+//! Counters of a node, and spans of its work.
 
 #[cfg(feature = "camera")]
 pub mod camera_troubles;

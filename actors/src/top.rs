@@ -48,7 +48,7 @@ pub struct CellView {
     pub verdicts: Option<Received<Verdicts>>,
     /// The newest reputations.
     pub reputations: Option<Received<Reputations>>,
-    /// Present troubles of the cell, with the node that tells each.
+    /// Current troubles of the cell, with the node that reports each.
     pub troubles: Vec<(Option<NodeName>, Trouble)>,
     /// The observer's counters.
     pub counters: CounterSnapshot,
@@ -332,7 +332,7 @@ fn vehicles(view: &CellView) -> Table<'_> {
             trusted(&member.name),
         ])
     });
-    // Vehicles that take part over MQTT only.
+    // Vehicles that are connected over MQTT only.
     let is_member = |node: &NodeName| view.members.iter().any(|member| member.name == *node);
     let others = reputations
         .into_iter()
@@ -365,7 +365,7 @@ fn vehicles(view: &CellView) -> Table<'_> {
 }
 
 fn counted(view: &CellView) -> Table<'_> {
-    // Copies that come a second way are no loss.
+    // Copies that arrive over a second path are not losses.
     const COPIES: &str = "out_of_order";
     const SHOWN: [&str; 5] = [
         "inbox_full",

@@ -1,4 +1,5 @@
-//! A cell's maps and reports as collective perception messages, and those of other stations as reports.
+//! Publishes a cell's maps and reports as collective perception messages, and other stations'
+//! messages as reports.
 //!
 //! ```text
 //! global_detections   -> cpm/global  the map, by the station of the node that fused it
@@ -28,16 +29,17 @@ use crate::cpm::{
 /// Level of the map's topic below `cpm`.
 const MAP_LEVEL: &str = "global";
 
-/// Most by which a message's time may differ from this machine's. A station's is that of GNSS: no other offset is one of its clock.
+/// Maximum difference between a message's time and this machine's. A station uses the time of GNSS,
+/// so a larger offset is not an error of its clock.
 const MAX_REFERENCE_TIME_DIFFERENCE: Duration = Duration::from_secs(2);
 
-/// Name under which refusals are counted when those of many receivers are counted apart.
+/// Name under which refusals of further receivers are counted when too many are counted separately.
 const OTHER_RECEIVERS: &str = "others";
 
-/// Age of the cell's description at which it is asked for anew.
+/// Age of the cell's description from which it is requested again.
 const DESCRIPTION_AGE: Duration = Duration::from_secs(1);
 
-/// A bridge beside a node.
+/// A bridge that runs in addition to a node.
 pub struct CpmBridge {
     cell: Cell,
     settings: Settings,
@@ -48,7 +50,7 @@ pub struct CpmBridge {
     failures: Failures,
 }
 
-/// Reason why a received message is no report.
+/// The reason why a received message is not reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum CpmRefusal {
     /// The message is not usable.
@@ -57,22 +59,23 @@ pub enum CpmRefusal {
     /// It has the station number of a node of this cell: an echo.
     #[error("a station number of this cell")]
     Own,
-    /// It is of another time, as a recorded message is, or one without leap seconds, or this machine's clock is wrong.
+    /// Its time is wrong: it may be recorded, its time may lack leap seconds, or this machine's
+    /// clock may be wrong.
     #[error("a time more than 2 s from this machine's, which 5 s of missing leap seconds are, too")]
     Time,
-    /// The station's messages come more often than there is room for beside other stations and the node itself.
+    /// The station sends more often than other stations and the node itself leave room for.
     #[error("more often than can be reported")]
     TooOften,
-    /// Another receiver brings the station already.
+    /// Another receiver already delivers this station's messages.
     #[error("a station that another receiver brings")]
     OtherReceiver,
-    /// As many stations as there is room for were heard lately.
+    /// The maximum number of stations was active recently.
     #[error("too many stations")]
     TooManyStations,
-    /// The node's broker does not let the station's part in.
+    /// The node's broker does not admit the station's part.
     #[error("the part for the station cannot connect")]
     NotConnected,
-    /// Its values are no report, or the node's broker refuses it.
+    /// Its values are not allowed in a report, or the node's broker refuses it.
     #[error("refused as a report")]
     Report,
 }
@@ -81,7 +84,8 @@ impl CpmBridge {
     /// Connects to a cell.
     ///
     /// # Errors
-    /// As [`Cell::connect`], and [`Error::Invalid`] if the cell's description has no `[origin]`.
+    /// Returns the errors of [`Cell::connect`], and [`Error::Invalid`] if the cell's description
+    /// has no `[origin]`.
     pub fn connect(settings: Settings) -> Result<Self, Error> {
         let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
         let name = NodeName::new(&settings.cell).map_err(|error| invalid(&error))?;
@@ -113,13 +117,13 @@ impl CpmBridge {
         })
     }
 
-    /// Carries messages until the connection is closed.
+    /// Transfers messages until the connection is closed.
     ///
     /// # Errors
-    /// [`Error::Refused`] when the node's broker refuses the bridge.
+    /// Returns [`Error::Refused`] if the node's broker refuses the bridge.
     ///
     /// # Panics
-    /// When one of its threads did.
+    /// Panics if one of its threads panicked.
     pub fn run(&self) -> Result<(), Error> {
         let carry: Vec<Carry<'_, Error>> = vec![
             Box::new(|| self.send_maps()),
@@ -129,12 +133,13 @@ impl CpmBridge {
         until_one_ends(carry, || self.cell.close())
     }
 
-    /// Ends the connection, and with it [`CpmBridge::run`].
+    /// Ends the connection, and thereby [`CpmBridge::run`].
     pub fn close(&self) {
         self.cell.close();
     }
 
-    /// Messages that became no report, by receiver and reason; beyond 256 pairs of these, the receiver is `others`.
+    /// Number of messages that were not reported, by receiver and reason; beyond 256 such pairs,
+    /// the receiver is `others`.
     pub fn refusals(&self) -> BTreeMap<(NodeName, CpmRefusal), u64> {
         self.refusals.counts()
     }
@@ -233,7 +238,7 @@ impl CpmBridge {
         stations.report(&message.receiver, received)
     }
 
-    /// The cell as it was described a second ago at most; the last known state while it cannot be had.
+    /// The cell according to a description that is at most a second old, or the last available one.
     fn described(&self) -> Arc<CpmCell> {
         let mut last = lock(&self.described);
         if last.0.elapsed() > DESCRIPTION_AGE {
@@ -253,7 +258,7 @@ impl CpmBridge {
         Arc::clone(&last.1)
     }
 
-    /// Counts a message that became no report.
+    /// Counts a message that was not reported.
     fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
         let rest = (NodeName::from_static(OTHER_RECEIVERS), refusal);
         if let Some(((receiver, _), count)) = self.refusals.note((receiver.clone(), refusal), rest)
@@ -274,7 +279,7 @@ fn described(cell: &Cell) -> Result<Option<CpmCell>, Error> {
     }))
 }
 
-/// Labels of the vacancy signs at the known locations of a description.
+/// Labels of the vacancy signs at the landmarks of a description.
 fn vacancy_signs(description: &str) -> BTreeSet<Label> {
     let settings: toml::Table = description.parse().unwrap_or_default();
     let landmarks = settings
@@ -303,7 +308,7 @@ struct Station {
 impl Stations<'_> {
     fn report(&mut self, receiver: &NodeName, received: ReceivedCpm) -> Result<(), CpmRefusal> {
         let (number, now) = (received.station_id, Instant::now());
-        // A place is for those who have something to say.
+        // Only a station with objects gets a place.
         if received.objects.is_empty() && !self.places.has(number) {
             return Ok(());
         }

@@ -1,5 +1,6 @@
-//! Bridges carry each kind of message on a thread of its own, and take messages only of their own time. They count what they
-//! refuse, and tell of each kind at once and then ever more rarely.
+//! Common parts of bridges. A bridge transfers each kind of message on its own thread, and accepts
+//! only messages with a current time. Refused messages are counted; the first of each kind is
+//! logged, then increasingly fewer.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -7,11 +8,11 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, SystemTime};
 
-/// Carries messages of one kind until the bridge is closed.
+/// Transfers messages of one kind until the bridge is closed.
 pub(crate) type Carry<'a, E> = Box<dyn Fn() -> Result<(), E> + Send + 'a>;
 
-/// Runs all at a time until one ends, which closes the others. A panic goes on here, so that the program does not end as if
-/// all were well.
+/// Runs all functions in parallel until one ends, which closes the others. A panic is propagated,
+/// so that the program does not end successfully.
 pub(crate) fn until_one_ends<E: Send>(
     carry: Vec<Carry<'_, E>>,
     close: impl Fn() + Sync,
@@ -34,18 +35,18 @@ pub(crate) fn until_one_ends<E: Send>(
     })
 }
 
-/// True if a time differs by this much from this machine's at most.
+/// True if a time differs from this machine's by at most `difference`.
 pub(crate) fn is_within(time: SystemTime, difference: Duration) -> bool {
     let earlier = SystemTime::now().duration_since(time);
     earlier.unwrap_or_else(|later| later.duration()) <= difference
 }
 
-/// The value that a mutex guards, also after a panic elsewhere.
+/// The value guarded by a mutex, even after a panic in another thread.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Numbers of what was refused, by kind.
+/// Numbers of refused messages, by kind.
 pub(crate) struct RefusalCounts<K>(Mutex<BTreeMap<K, u64>>);
 
 impl<K> Default for RefusalCounts<K> {
@@ -55,10 +56,11 @@ impl<K> Default for RefusalCounts<K> {
 }
 
 impl<K: Clone + Ord> RefusalCounts<K> {
-    /// Maximum number of kinds that are counted apart.
+    /// Maximum number of kinds that are counted separately.
     const MAX_KINDS: usize = 256;
 
-    /// Counts one, beyond [`Self::MAX_KINDS`] as one of `rest`. Gives kind and count for the log when the count is a power of ten.
+    /// Counts one message; beyond [`Self::MAX_KINDS`], as one of `rest`. Returns kind and count for
+    /// the log if the count is a power of ten.
     pub(crate) fn note(&self, kind: K, rest: K) -> Option<(K, u64)> {
         let mut counts = lock(&self.0);
         let has_room = counts.len() < Self::MAX_KINDS || counts.contains_key(&kind);
@@ -74,12 +76,12 @@ impl<K: Clone + Ord> RefusalCounts<K> {
     }
 }
 
-/// Names of what fails at present: the log tells of each once, until it is well again.
+/// Names of current failures: each is logged once, until it is over.
 #[derive(Default)]
 pub(crate) struct Failures(Mutex<BTreeSet<String>>);
 
 impl Failures {
-    /// True if this begins to fail.
+    /// True if this failure is new.
     pub(crate) fn begins(&self, name: &str) -> bool {
         lock(&self.0).insert(name.to_owned())
     }

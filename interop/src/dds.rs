@@ -1,4 +1,5 @@
-//! Live topics of ROS 2, by DDS: a cell's messages for ROS, and a detector's messages from ROS as reports.
+//! Live topics of ROS 2, by DDS: a cell's messages for ROS, and a detector's messages from ROS as
+//! reports.
 //!
 //! ```text
 //! global_detections -> /ecod/map/detections, /ecod/map/markers
@@ -43,19 +44,19 @@ use detections::{RefusedInput, place_in_pictures, pose_in_map};
 /// Part of the node's name in which detections are reported.
 const PART: &str = "ros2";
 
-/// Samples of a topic that are kept for slow readers, as ROS does unless told otherwise.
+/// Number of samples of a topic that are kept for slow readers, the default of ROS.
 const DEPTH: i32 = 10;
 
-/// Time after which a topic on which nothing is said is given up, as that of a vehicle that has left.
+/// Silence after which a topic is closed, for example when its vehicle has left.
 const SILENCE: Duration = Duration::from_secs(60);
 
-/// Most by which a stamp may differ from this machine's time.
+/// Maximum difference between a stamp and this machine's time.
 const MAX_STAMP_DIFFERENCE: Duration = Duration::from_secs(10);
 
 /// The last domain that has ports of UDP.
 pub const MAX_DOMAIN: u16 = 232;
 
-/// Time after which the log tells of topics of the detector on which nothing came.
+/// Time after which silent topics of the detector are logged.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Domain, network and input of a bridge.
@@ -74,7 +75,7 @@ pub struct RosSettings {
 }
 
 impl RosSettings {
-    /// All topics that are taken from ROS.
+    /// All topics that are read from ROS.
     fn taken(&self) -> impl Iterator<Item = &String> {
         let (detections, optics) = match &self.input {
             Some(DetectorTopics::InSpace(topic)) => (Some(topic), None),
@@ -94,24 +95,25 @@ pub enum DetectorTopics {
     InPictures(String, String),
 }
 
-/// A bridge that cannot go on.
+/// A bridge that cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum RosBridgeError {
-    /// No part in the DDS domain, or a topic that is not possible there.
+    /// The DDS domain cannot be joined, or a topic is not possible there.
     #[error("DDS: {0}; is the domain right, and the network up?")]
     Dds(String),
     /// A domain beyond the last.
     #[error("domain {0} is none of 0 to {MAX_DOMAIN}")]
     Domain(u16),
-    /// A network in which this machine has no part.
+    /// A network to which this machine does not belong.
     #[error("network {0}: no address of this machine; `ip address` shows them")]
     Network(IpAddr),
-    /// A topic below `/ecod`, which a bridge publishes. As reports, what a cell says would confirm itself.
+    /// A topic below `/ecod`, which a bridge publishes. If it were reported, the cell's messages
+    /// would confirm themselves.
     #[error(
         "{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself"
     )]
     OwnTopic(String),
-    /// No part in the cell.
+    /// The cell cannot be joined.
     #[error(transparent)]
     Cell(#[from] Error),
 }
@@ -122,7 +124,7 @@ impl RosBridgeError {
     }
 }
 
-/// A bridge beside a node.
+/// A bridge that runs in addition to a node.
 pub struct RosBridge {
     cell: Cell,
     camera: RosCamera,
@@ -136,7 +138,7 @@ pub struct RosBridge {
     refusals: RefusalCounts<InputRefusal>,
 }
 
-/// A topic that is taken from ROS.
+/// A topic that is read from ROS.
 struct DetectorInput {
     topic: String,
     kind: &'static str,
@@ -149,7 +151,7 @@ enum Taken {
     InPicture(Detection2DArray),
     Optics(Box<CameraInfo>),
     Pose(PoseStamped),
-    /// The detector had time to begin.
+    /// The time for the detector to start is over.
     Patience,
     Closed,
 }
@@ -158,7 +160,7 @@ impl RosBridge {
     /// Connects to a cell and joins a domain.
     ///
     /// # Errors
-    /// [`RosBridgeError`] if either is not possible, or a topic to be taken is one of a bridge.
+    /// Returns a [`RosBridgeError`] if either fails, or an input topic belongs to a bridge.
     pub fn connect(settings: Settings, ros: RosSettings) -> Result<Self, RosBridgeError> {
         if let Some(own) = ros
             .taken()
@@ -199,10 +201,11 @@ impl RosBridge {
         })
     }
 
-    /// Carries messages until the bridge is closed.
+    /// Transfers messages until the bridge is closed.
     ///
     /// # Errors
-    /// [`RosBridgeError`] when the node's broker refuses the bridge, or DDS a topic.
+    /// Returns a [`RosBridgeError`] if the node's broker refuses the bridge, or DDS refuses a
+    /// topic.
     pub fn run(&self) -> Result<(), RosBridgeError> {
         let mut carry: Vec<Carry<'_, RosBridgeError>> = vec![
             Box::new(|| self.send_maps()),
@@ -214,7 +217,7 @@ impl RosBridge {
         until_one_ends(carry, || self.close())
     }
 
-    /// Ends the connections, and with them [`RosBridge::run`].
+    /// Ends the connections, and thereby [`RosBridge::run`].
     pub fn close(&self) {
         self.cell.close();
         lock(&self.closing).take();
@@ -318,7 +321,7 @@ impl RosBridge {
         Ok(())
     }
 
-    /// Takes a pose of the camera, if it is one of this time and later than those before.
+    /// Processes a pose of the camera, if its time is current and later than the previous poses.
     fn take_pose(&self, stamped: &PoseStamped, poses: &mut PoseHistory) {
         let taken = pose_in_map(stamped).and_then(|(at, pose)| {
             let is_near = is_within(
@@ -337,13 +340,13 @@ impl RosBridge {
         }
     }
 
-    /// Messages of a topic of ROS; those that cannot be decoded are counted.
+    /// Messages of a topic of ROS; undecodable ones are counted.
     fn read<M: RosMessage + DeserializeOwned + Send + 'static>(
         &self,
         name: &str,
         taken: fn(M) -> Taken,
     ) -> Result<BoxStream<'_, Taken>, RosBridgeError> {
-        // A reader that does not ask for more takes from reliable writers, too.
+        // A best-effort reader also receives from reliable writers.
         let qos = qos(Reliability::BestEffort);
         let topic = ros_topic::<M>(&self.participant, name, &qos)?;
         let subscriber = self
@@ -373,7 +376,7 @@ impl RosBridge {
         Ok(samples.boxed())
     }
 
-    /// Tells of topics on which nothing came.
+    /// Logs the topics on which no message has arrived.
     fn tell_of_silence(&self) {
         for DetectorInput { topic, kind, heard } in lock(&self.inputs).iter() {
             if !heard.load(Ordering::Relaxed) {
@@ -384,7 +387,7 @@ impl RosBridge {
         }
     }
 
-    /// Counts something that is not reported.
+    /// Counts an input that is not reported.
     fn note(&self, refused: RefusedInput) {
         let RefusedInput { refusal, detail } = refused;
         if let Some((refusal, count)) = self.refusals.note(refusal, refusal) {
@@ -424,7 +427,7 @@ fn ros_topic<M: RosMessage>(
         .map_err(RosBridgeError::dds)
 }
 
-/// Topics of a domain that messages are put on, each announced with its first message.
+/// Topics of a domain for publishing, each announced with its first message.
 struct LiveTopics<'a> {
     participant: &'a DomainParticipant,
     topics: BTreeMap<String, LiveTopic>,

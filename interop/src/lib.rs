@@ -1,8 +1,10 @@
-//! A cell in the languages of others: bridges that run beside a node, connected as any program is.
+//! Bridges that run in addition to a node and connect a cell to other systems' message formats.
+//! They connect like any local program.
 //!
-//! [`cpm`] writes and reads ETSI's collective perception messages; [`bridge`] carries them between a cell and other
-//! stations. `ros2` writes logs for ROS; `dds` carries messages between a cell and ROS. `docs/interoperability.md` and
-//! `docs/ros2.md` have the tables of what is mapped, and of what is lost.
+//! [`cpm`] writes and reads ETSI's collective perception messages; [`bridge`] transfers them
+//! between a cell and other stations. `ros2` writes logs for ROS; `dds` transfers messages between
+//! a cell and ROS. `docs/interoperability.md` and `docs/ros2.md` contain the tables of mapped and
+//! lost fields.
 
 #![deny(
     clippy::unwrap_used,

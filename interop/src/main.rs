@@ -1,4 +1,4 @@
-//! Program `ecod-interop`: bridges between a cell and the languages of others.
+//! Program `ecod-interop`: bridges between a cell and other systems' message formats.
 
 #[cfg(feature = "ros2")]
 use std::fmt::Display;
@@ -17,7 +17,8 @@ use {
     ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings},
 };
 
-/// Bridges between a cell and the messages of other stations. Runs beside a node, as any program does.
+/// Bridges between a cell and the messages of other stations. Runs in addition to a node, like any
+/// local program.
 #[derive(Parser)]
 #[command(name = "ecod-interop", version)]
 struct Cli {
@@ -27,7 +28,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Maps and reports of the cell as ETSI CPM on `cpm/global` and `cpm/<node>`; CPMs on `cpm/received/<name>` as reports.
+    /// Maps and reports of the cell as ETSI CPM on `cpm/global` and `cpm/<node>`; CPMs on
+    /// `cpm/received/<name>` as reports.
     Cpm(Connection),
     /// A log as MCAP of profile ros2: detections, markers, poses of cameras, pictures.
     #[cfg(feature = "ros2")]
@@ -51,10 +53,12 @@ struct RosOptions {
     /// Domain of DDS, 0 to 232.
     #[arg(long, env = "ROS_DOMAIN_ID", default_value = "0", value_parser = domain)]
     domain: u16,
-    /// Address of this machine in a network in which to announce itself; may be given several times. Default: in all.
+    /// Address of this machine in a network in which to announce itself; may be given several
+    /// times. Default: in all.
     #[arg(long, value_name = "ADDRESS")]
     network: Vec<std::net::IpAddr>,
-    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose or --pose-topic.
+    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in the frame of a camera with a
+    /// --pose or --pose-topic.
     #[arg(long, value_name = "TOPIC", group = "detections")]
     detections_3d: Option<String>,
     /// Topic of vision_msgs/Detection2DArray: boxes in pictures without distortion.
@@ -66,7 +70,8 @@ struct RosOptions {
     /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
     #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
     pose: Option<Pose>,
-    /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x ahead.
+    /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x
+    /// ahead.
     #[arg(
         long,
         value_name = "TOPIC",
@@ -80,7 +85,8 @@ struct RosOptions {
     /// Angle of the camera's axis below the horizon in degrees.
     #[arg(long, default_value_t = 0.0, allow_hyphen_values = true, value_parser = finite)]
     pitch_deg: f64,
-    /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and `pixel_sigma_px = 3`.
+    /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and
+    /// `pixel_sigma_px = 3`.
     #[arg(long, value_name = "FILE")]
     projection: Option<PathBuf>,
     /// Label of a class of the detector, such as 0=person; may be given several times.
@@ -177,16 +183,16 @@ fn class_label(text: &str) -> Result<(String, String), String> {
     Ok((class.to_owned(), label.to_owned()))
 }
 
-/// Where the node is, and its name. All can be set by the environment, as for nodes.
+/// Address of the node, and its name. All options can be set by the environment, as for nodes.
 #[derive(Args)]
 struct Connection {
-    /// HOST:PORT of the node's door.
+    /// HOST:PORT of the node's local broker.
     #[arg(long, env = "ECOD_BROKER")]
     broker: Option<String>,
     /// Name of the cell.
     #[arg(long, env = "ECOD_CELL")]
     cell: Option<String>,
-    /// Name of the node beside which the program runs. Default: the machine's host name.
+    /// Name of the program's node. Default: the machine's host name.
     #[arg(long, env = "ECOD_NAME")]
     node: Option<String>,
     /// Certificate of the cell's authority (PEM).
@@ -260,7 +266,7 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
             .map_err(|error| format!("{}: {error}", log.display()))
     };
     let done = write().map_err(|error| {
-        // A part of a file, and in the way of the next try.
+        // An incomplete file, which would block the next attempt.
         let removed = std::fs::remove_file(output).err();
         let left = removed
             .map(|error| format!("; {} is left there: {error}", output.display()))
@@ -283,7 +289,7 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
     Ok(())
 }
 
-/// A log, or those of a directory in the order of their names.
+/// A log, or the logs of a directory sorted by name.
 #[cfg(feature = "ros2")]
 fn logs(path: &std::path::Path) -> Result<Vec<PathBuf>, String> {
     if !path.is_dir() {

@@ -1,16 +1,18 @@
-//! An object as maps, known locations and reports have it, for all languages.
+//! The common form of an object from maps, landmarks and reports, for all message formats.
 
 use std::collections::BTreeMap;
 
 use ecod::model::names::Label;
 use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
 
-/// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m` as length and width.
+/// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m`
+/// as length and width.
 #[derive(Debug, Clone)]
 pub(crate) struct CellObject<'a> {
     pub(crate) label: &'a Label,
     pub(crate) confidence: f64,
-    /// Confidence of each class, in a map the share of each; empty where only that of the label is known.
+    /// Confidence of each class, or in a map the share of each; empty if there is only the label's
+    /// confidence.
     pub(crate) scores: &'a BTreeMap<Label, f64>,
     pub(crate) position_m: [f64; 2],
     pub(crate) covariance_m2: Option<[f64; 3]>,
@@ -52,7 +54,7 @@ impl<'a> From<&'a PerceivedObject> for CellObject<'a> {
 }
 
 impl<'a> CellObject<'a> {
-    /// Objects of a map and what stands at its known locations, each with its id.
+    /// Objects of a map and objects at its landmarks, each with its id.
     #[cfg(feature = "ros2")]
     pub(crate) fn all_of(map: &'a ecod::wire::GlobalMap) -> impl Iterator<Item = (Self, String)> {
         let objects = map
@@ -66,7 +68,7 @@ impl<'a> CellObject<'a> {
         )
     }
 
-    /// What stands at a known location; `None` if nothing does.
+    /// The object at a landmark; `None` if it is empty.
     pub(crate) fn at(landmark: &'a LandmarkState) -> Option<Self> {
         Some(Self {
             label: landmark.label.as_ref()?,

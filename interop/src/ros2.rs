@@ -1,7 +1,8 @@
-//! A cell as messages of ROS 2, without ROS code on this side.
+//! Converts a cell's messages to ROS 2, without ROS code on this side.
 //!
-//! Frames are those of REP 103 and REP 105: `map` is the cell's frame, x east and y north unless the cell's origin is rotated.
-//! `<node>_camera` is a camera, x along its axis and z up; `<node>_camera_optical` the same camera, z along its axis and x right.
+//! Frames follow REP 103 and REP 105: `map` is the cell's frame, x east and y north unless the
+//! cell's origin is rotated. `<node>_camera` is a camera, x along its axis and z up;
+//! `<node>_camera_optical` the same camera, z along its axis and x right.
 
 mod camera;
 mod detections;
@@ -35,7 +36,7 @@ pub(crate) use pictured::Detection2DArray;
 
 /// Destination of messages: a file, or live topics.
 pub(crate) trait RosSink {
-    /// The reason why a message was not taken.
+    /// Error if a message was not accepted.
     type Error;
 
     /// Takes a message.
@@ -70,8 +71,8 @@ pub(crate) fn put_report<S: RosSink>(report: &ObjectReport, sink: &mut S) -> Res
     sink.put("/tf", &transforms)
 }
 
-/// A node's name as names in ROS allow it: letters and digits with single `_` between them, no digit first. A `_` in front would
-/// hide the topic, and `map` is the cell's.
+/// A node's name as names in ROS allow it: letters and digits with single `_` between them, no
+/// digit first. A `_` in front would hide the topic, and `map` is the cell's.
 fn ros_name(node: &NodeName) -> String {
     let words: Vec<_> = node
         .as_str()

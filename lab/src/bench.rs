@@ -1,19 +1,21 @@
-//! Measures a live cell from outside: how long reports take to come back as maps and as verdicts, beside the bare
-//! broker, and how many vehicles it carries.
+//! Measures a live cell from outside: how long reports take to come back as maps and as verdicts,
+//! compared to the bare broker, and how many vehicles the cell can serve.
 //!
 //! ```text
 //! driver ── on schedule ──> vehicles ── votes, reports ─> broker ──> aggregator ── map, verdicts ─────> broker ──> vehicles
 //!        └─ in between ───> vehicles ── same bytes ─────> broker ──> echo ── as many bytes, twice ───> broker ──> vehicles
 //! ```
 //!
-//! - Open loop: when each report is due is fixed before the run, and time counts from then. What delays a report, in this
-//!   process too, is part of its time, and no slow answer makes the load lighter (no coordinated omission).
-//! - The bare way differs from the cell's in the aggregator alone: the same connections, packets of the same size, the
-//!   same fan-in and fan-out, half a period later. Its echo answers when the packets of all vehicles are there.
-//! - A vehicle votes before it reports, over one connection: where a map rests on the reports of all, their votes came
-//!   before, and the verdicts of the same round count them.
-//! - A vehicle reads no more of a map than its round and whose reports it rests on: a thousand vehicles in one process
-//!   that decode maps would measure each other.
+//! - Open loop: the due time of each report is fixed before the run, and latency is measured from
+//!   that time. All delays of a report, including those in this process, are part of its latency,
+//!   and slow answers do not reduce the load (no coordinated omission).
+//! - The bare path differs from the cell's path only in the aggregator: it has the same
+//!   connections, packet sizes, fan-in and fan-out, half a period later. Its echo answers when the
+//!   packets of all vehicles have arrived.
+//! - A vehicle votes before it reports, over one connection: when a map includes the reports of all
+//!   vehicles, their votes arrived before, and the verdicts of the same round count them.
+//! - A vehicle only reads the round of a map and the reports that it includes: a thousand vehicles
+//!   in one process that decoded whole maps would measure each other.
 
 pub mod access;
 pub mod aggregator;

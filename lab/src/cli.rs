@@ -19,7 +19,8 @@ use clap::{Parser, Subcommand};
 use ecod_actors::cli::{LogArguments, exit, start_log};
 use serde::Serialize;
 
-/// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which lies beside this one.
+/// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which must be in the
+/// same directory.
 #[derive(Debug, Parser)]
 #[command(name = "ecod-lab", version)]
 struct Cli {
@@ -31,19 +32,22 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a whole cell on this machine, as separate processes, and print what it saw
+    /// Run a whole cell on this machine, as separate processes, and print the results
     Demo(demo::DemoArguments),
-    /// Write the street that `ecod-node try` shows: a video and a configuration for each camera that stays where it is
+    /// Write the street that `ecod-node try` shows: a video and a configuration for each camera
+    /// that stays where it is
     Street(street::StreetArguments),
-    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
+    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections
+    /// were
     Testbed(testbed::TestbedArguments),
-    /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
+    /// Measure a live cell under simulated vehicles: latency compared to the bare broker, capacity,
+    /// costs
     Bench(bench::BenchArguments),
-    /// Write one page about a log, as `ecod-node report`, judged by what is true
+    /// Write one page about a log, as `ecod-node report`, evaluated against the truth
     Report(report::LogReportArguments),
     /// Convert detections in files of benchmarks to reports, which `ecod-node replay` fuses
     Convert(convert::ConvertArguments),
-    /// Judge the output of a replay by what is true
+    /// Evaluate the output of a replay against the truth
     Eval(eval::EvalArguments),
 }
 

@@ -1,4 +1,5 @@
-//! A whole cell on this machine: one process for the edge and one for each vehicle, watched from outside.
+//! A whole cell on this machine: one process for the edge and one for each vehicle, watched from
+//! outside.
 //!
 //! ```text
 //! demo ── spawns ──> ecod-node --role edge
@@ -45,9 +46,9 @@ pub struct Demo<'a> {
     pub scene: &'a Scene,
     /// Time for which the maps are judged.
     pub duration: Duration,
-    /// Where configurations and logs go.
+    /// Directory for configurations and logs.
     pub directory: &'a Path,
-    /// Where the first vehicle serves its page.
+    /// Address of the first vehicle's page.
     pub dashboard: SocketAddr,
 }
 
@@ -56,9 +57,9 @@ pub struct Demo<'a> {
 pub struct DemoResult {
     /// Accuracies.
     pub result: SceneResult,
-    /// Maps that at least one vehicle got.
+    /// Number of maps that at least one vehicle received.
     pub maps: usize,
-    /// Maps that a vehicle of the cell did not get.
+    /// Number of maps that a vehicle of the cell did not receive.
     pub missed: usize,
     /// Time from the capture of the oldest report in a map to its receipt by a vehicle, median.
     pub median_age: Duration,
@@ -66,17 +67,18 @@ pub struct DemoResult {
     pub last_map: Option<GlobalMap>,
     /// The vehicles' reports.
     pub reports: Vec<ObservedReport>,
-    /// From when on the maps are judged.
+    /// Time from which on the maps are evaluated.
     pub from: Timestamp,
     /// Terms of all leaders, in order.
     pub terms: Vec<JudgedTerm>,
 }
 
 impl Demo<'_> {
-    /// Runs the scene; `progress` is told once a second.
+    /// Runs the scene; `progress` is called once a second.
     ///
     /// # Errors
-    /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
+    /// Returns an error if a node does not start or ends early, `progress` fails, or a file cannot
+    /// be written; all nodes are stopped in any case.
     pub async fn run(
         &self,
         progress: impl Fn(Progress) -> anyhow::Result<()>,

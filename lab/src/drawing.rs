@@ -5,7 +5,7 @@ use svg::node::element::Rectangle;
 
 /// Colour of texts.
 pub(crate) const INK: &str = "#222222";
-/// Fonts of texts, the first that is there.
+/// Fonts of texts; the first available one is used.
 pub(crate) const FONT: &str = "DejaVu Sans, Verdana, Helvetica, Arial, sans-serif";
 
 /// An empty white page of a size in pixels, with texts of a height.

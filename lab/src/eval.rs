@@ -1,12 +1,13 @@
-//! Accuracy of maps and verdicts, beside majority vote and every vehicle alone.
+//! Accuracy of maps and verdicts, compared to majority vote and to every vehicle alone.
 //!
-//! An item is one location for as long as its truth stays the same. It is judged by the last label that was given for
-//! it in that time, `null` if there was none; where nothing stands, by the last entry. Beside this, every entry of
-//! every line counts in [`Scores::rounds`]. Baselines need the reports: all votes on an item count alike, a vehicle
-//! alone is the majority of its own votes, ties count as the chance of drawing the right label among the first.
+//! An item is one location for as long as its truth stays constant. It is evaluated by the last
+//! label given for it in that time (`null` without a label), or, if no object stands there, by the
+//! last entry. In addition, every entry of every line counts in [`Scores::rounds`]. Baselines need
+//! the reports: all votes on an item have equal weight, a vehicle alone is the majority of its own
+//! votes, and ties count as the chance of drawing the right label among the most frequent ones.
 //!
-//! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with
-//! every report, in any order; then [`Evaluation::result`].
+//! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines,
+//! [`Evaluation::report`] with every report, in any order; then [`Evaluation::result`].
 
 pub mod baselines;
 pub mod formats;
@@ -43,18 +44,18 @@ pub struct EvalResult {
     pub vote: Option<Scores>,
 }
 
-/// Accuracy of one algorithm. Shares are percentages; `None` where nothing could be judged.
+/// Accuracy of one algorithm. Shares are percentages; `None` without evaluated items.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scores {
     /// Maps, or sets of verdicts, that were read.
     pub lines: u64,
-    /// Items that were judged: all that the truth names and that a line could speak of.
+    /// Evaluated items: all items in the truth to which a line could refer.
     pub items: u64,
-    /// Right items of all; one without a label counts as wrong unless nothing stands there.
+    /// Share of right items; an item without a label is right only if no object stands there.
     pub accuracy_pct: Option<f64>,
-    /// Items at which something stands and a label was given, of all at which something stands.
+    /// Share of items with a label among the items with an object.
     pub coverage_pct: Option<f64>,
-    /// Right items of those that were given a label.
+    /// Share of right items among the items with a label.
     pub labelled_accuracy_pct: Option<f64>,
     /// Every entry of every line.
     pub rounds: RoundScores,
@@ -73,37 +74,37 @@ pub struct Scores {
 /// Items of one class.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ClassRecall {
-    /// The first accepted label; null where nothing stands.
+    /// The first accepted label; null if no object stands there.
     pub truth: Option<Label>,
     /// Items.
     pub items: u64,
-    /// Right ones in percent.
+    /// Share of right items in percent.
     pub recall_pct: Option<f64>,
 }
 
 /// Entries of all lines.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct RoundScores {
-    /// Entries whose truth is known.
+    /// Entries with a truth.
     pub entries: u64,
     /// Right ones.
     pub right: u64,
-    /// Right ones in percent.
+    /// Share of right entries in percent.
     pub accuracy_pct: Option<f64>,
 }
 
 /// One cell of a confusion matrix.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct ConfusionCell {
-    /// The first accepted label; null where nothing stands.
+    /// The first accepted label; null if no object stands there.
     pub truth: Option<Label>,
-    /// Label that was given; null for none.
+    /// The given label; null without a label.
     pub said: Option<Label>,
     /// Items.
     pub count: u64,
 }
 
-/// Takes a replay's output and its reports apart; see the module.
+/// Evaluates a replay's output and its reports; see the module.
 #[derive(Debug, Clone)]
 pub struct Evaluation {
     truth: Truth,
@@ -129,8 +130,8 @@ struct Last {
 }
 
 impl Scores {
-    /// The shares of a summary's row in percent: accuracy, coverage, accuracy where labelled, that of all lines, and of
-    /// the majority.
+    /// The shares of a summary's row in percent: accuracy, coverage, accuracy of labelled items,
+    /// accuracy of all lines, and accuracy of the majority.
     pub fn shares_pct(&self) -> [Option<f64>; 5] {
         let Self {
             accuracy_pct,
@@ -151,7 +152,7 @@ impl Scores {
 }
 
 impl Evaluation {
-    /// Nothing read yet.
+    /// An evaluation without any input yet.
     pub fn new(truth: Truth) -> Self {
         Self {
             truth,
@@ -162,14 +163,16 @@ impl Evaluation {
         }
     }
 
-    /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
+    /// Names the location of objects whose report does not, and translates synonyms, as a node of
+    /// the cell would.
     #[must_use]
     pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
         self.cell = Some((landmarks, gate));
         self
     }
 
-    /// Translates votes by the cell's synonyms, as VOTE does where a location has none of its own.
+    /// Translates votes by the cell's synonyms, like VOTE at a location without synonyms of its
+    /// own.
     #[must_use]
     pub fn with_synonyms(mut self, synonyms: BTreeMap<Label, Label>) -> Self {
         self.synonyms = synonyms;

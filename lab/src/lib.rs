@@ -1,4 +1,4 @@
-//! The laboratory of ECOD: tools that measure and show a cell. None of them runs on a vehicle.
+//! The laboratory of ECOD: tools that measure and show a cell. They don't run on vehicles.
 //!
 //! ```text
 //! traffic   generated towns: reports and truth

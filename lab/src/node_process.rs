@@ -32,7 +32,7 @@ impl NodeProcess {
     /// Writes the node's configuration to the directory and starts it; its log goes there too.
     ///
     /// # Errors
-    /// When a file cannot be written or the program cannot be run.
+    /// Returns an error if a file cannot be written or the program cannot be run.
     pub fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
         let name = config
             .name
@@ -61,7 +61,7 @@ impl NodeProcess {
     /// Starts the node again, with its configuration; the log goes on.
     ///
     /// # Errors
-    /// When the program cannot be run.
+    /// Returns an error if the program cannot be run.
     pub fn restart(&mut self) -> anyhow::Result<()> {
         self.child = spawn(&self.program, &self.file, &self.log)?;
         self.starts += 1;
@@ -72,7 +72,7 @@ impl NodeProcess {
     /// SIGKILL: the node has no time for farewells.
     ///
     /// # Errors
-    /// When the operating system refuses.
+    /// Returns an error if the operating system refuses.
     pub async fn kill(&mut self) -> anyhow::Result<()> {
         self.killed = true;
         self.child
@@ -94,7 +94,7 @@ impl NodeProcess {
     /// Looks whether it still runs.
     ///
     /// # Errors
-    /// When the process has ended by itself, with the last line of its log.
+    /// Returns an error if the process has ended by itself, with the last line of its log.
     pub fn check(&mut self) -> anyhow::Result<()> {
         if !self.killed
             && let Some(status) = self.child.try_wait()?
@@ -109,7 +109,7 @@ impl NodeProcess {
     /// The address that the node names in its log by this message, as soon as it does.
     ///
     /// # Errors
-    /// When the process has ended by itself.
+    /// Returns an error if the process has ended by itself.
     pub async fn address(&mut self, message: &str) -> anyhow::Result<SocketAddr> {
         loop {
             let log = fs::read_to_string(&self.log).unwrap_or_default();
@@ -134,7 +134,7 @@ impl NodeProcess {
         self.child.id()
     }
 
-    /// Asks the node to stop, and makes it stop when it does not.
+    /// Requests the node to stop, and kills it if it does not.
     pub async fn stop(&mut self) {
         let pid = self
             .child
@@ -156,18 +156,18 @@ impl NodeProcess {
     }
 }
 
-/// The program `ecod-node` that lies beside this program.
+/// The program `ecod-node` in the directory of this program.
 ///
 /// # Errors
-/// When there is none.
+/// Returns an error if there is no such program.
 pub fn node_program() -> anyhow::Result<PathBuf> {
     node_beside(&std::env::current_exe().context("this program cannot be found")?)
 }
 
-/// The program `ecod-node` that lies beside `program`.
+/// The program `ecod-node` in the directory of `program`.
 ///
 /// # Errors
-/// When there is none.
+/// Returns an error if there is no such program.
 pub fn node_beside(program: &Path) -> anyhow::Result<PathBuf> {
     let node = program.with_file_name("ecod-node");
     let profile = if cfg!(debug_assertions) {
@@ -183,14 +183,14 @@ pub fn node_beside(program: &Path) -> anyhow::Result<PathBuf> {
     Ok(node)
 }
 
-/// First and last port that is given to a node: below those of outgoing connections, one of which could take it before the
-/// node does.
+/// First and last port for nodes: below the range for outgoing connections, which could otherwise
+/// take a port before the node does.
 const PORTS: [usize; 2] = [18_000, 31_999];
 
-/// An address on which nothing listens now, for TCP or UDP; another one each time.
+/// An unused address for TCP or UDP; each call returns another one.
 ///
 /// # Errors
-/// When loopback has no free port.
+/// Returns an error if loopback has no free port.
 pub fn free_address() -> anyhow::Result<SocketAddr> {
     static GIVEN: AtomicUsize = AtomicUsize::new(0);
     let [first, last] = PORTS;
@@ -210,7 +210,7 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
     let output = File::options().append(true).open(log);
     let output = output.with_context(|| format!("cannot write {}", log.display()))?;
     let mut command = Command::new(program);
-    // The node is what its file says, whatever the environment says to others.
+    // The node must only use its file, so variables of the environment are removed.
     for (key, _) in
         std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
     {
@@ -219,7 +219,8 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
     command
         .args(["--log-format", "text", "--config"])
         .arg(file)
-        // The pipe is never written to; it closes with this process, however that ends, and so ends the node.
+        // The pipe is not written to; it closes when this process ends in any way, which ends the
+        // node.
         .arg("--stop-at-eof")
         .stdin(Stdio::piped())
         .stdout(Stdio::null())

@@ -1,4 +1,4 @@
-//! The page about a log, with sections on how right maps and verdicts were, by the truth that is given.
+//! The page about a log, with sections on the accuracy of maps and verdicts, by the given truth.
 
 pub(crate) mod tracks;
 
@@ -12,17 +12,17 @@ use crate::eval::tracks::{TrackEvaluation, TrackTruth};
 use crate::eval::{Evaluation, Scores, Truth};
 use tracks::{tables, without_map};
 
-/// A report that judges maps and verdicts by what stands at each location.
+/// A report that evaluates maps and verdicts by the true object at each location.
 pub fn judged_by(truth: Truth) -> Report {
     Report::with_section(Locations(Evaluation::new(truth)))
 }
 
-/// A report that judges the objects of maps by where they really were.
+/// A report that evaluates the objects of maps by their true positions.
 pub fn judged_by_tracks(truth: TrackTruth) -> Report {
     Report::with_section(Objects(TrackEvaluation::new(truth)))
 }
 
-/// Accuracy at known locations.
+/// Accuracy at landmarks.
 #[derive(Debug)]
 struct Locations(Evaluation);
 

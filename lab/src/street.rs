@@ -1,8 +1,10 @@
-//! A street that lives: cars drive around its two ends, people walk, and cars, vans and houses hide what is behind them.
+//! A generated street: cars drive around its two ends, people walk, and cars, vans and houses hide
+//! objects behind them.
 //!
-//! Cars and people wear placards on four sides, so that a real detector reads rendered pictures. A placard says what wears it,
-//! `car` or `person`, and not which one: telling one from another is left to the cell. The motion is a function of time alone, so
-//! that the truth is known at every moment.
+//! Cars and people wear placards on four sides, so that a real detector can read rendered pictures.
+//! A placard states the kind of its wearer, `car` or `person`, but not which one: distinguishing
+//! individuals is the cell's task. The motion is a function of time alone, so that the truth is
+//! available for every moment.
 
 mod depth_order;
 pub mod film;
@@ -25,10 +27,10 @@ use route::Route;
 const QUIET_MODULES: usize = 2;
 const CODE_MODULES: usize = 21;
 
-/// All that stands and moves in the street, and the cameras that look at it.
+/// All bodies in the street, and its cameras.
 #[derive(Debug, Clone)]
 pub struct Street {
-    /// People, cars, and what has no label: houses and a kiosk.
+    /// People, cars, and bodies without a label: houses and a kiosk.
     pub bodies: Vec<StreetBody>,
     /// The cameras.
     pub cameras: Vec<StreetCamera>,
@@ -129,7 +131,8 @@ impl Street {
 }
 
 impl StreetBody {
-    /// Length and width around all parts, and the middle of that in the frame of the body.
+    /// Length and width around all parts, and the middle of this rectangle in the frame of the
+    /// body.
     fn extent(&self) -> (Point2<f64>, [f64; 2]) {
         let ends = |middle: fn(&Solid) -> f64, size: fn(&Solid) -> f64| {
             let low = self

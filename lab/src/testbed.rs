@@ -1,7 +1,9 @@
-//! The parking-lot testbed of the paper (§V): scenes of placards and cameras, in metres and radians.
+//! The parking-lot testbed of the paper (§V): scenes of placards and cameras, in metres and
+//! radians.
 //!
-//! Every spot has a placard `EMPTY` at its back. A parked vehicle is a second placard in front of it whose code reads
-//! the plate; it hides the first from most directions. Files are in inches and degrees and converted while being read.
+//! Every spot has a placard `EMPTY` at its back. A parked vehicle is a second placard in front of
+//! it whose code reads the plate; it hides the first from most directions. Files are in inches and
+//! degrees and converted while being read.
 
 pub mod birdseye;
 pub mod camera;
@@ -45,7 +47,8 @@ impl Testbed {
     /// Reads a scene file.
     ///
     /// # Errors
-    /// [`TestbedError`] when the text is not JSON, or names the scene, the key and what is wrong with its value.
+    /// Returns a [`TestbedError`] if the text is not JSON; otherwise it names the scene, the key
+    /// and the fault of its value.
     pub fn from_json(text: &str) -> Result<Self, TestbedError> {
         file::read(text)
     }
@@ -55,8 +58,8 @@ impl Testbed {
         self.scenes.iter().find(|scene| scene.name == name)
     }
 
-    /// All cards that stand in a scene: of each spot its `EMPTY` placard, if it has one, and then its plate, if a
-    /// vehicle is parked there.
+    /// All cards that stand in a scene: of each spot its `EMPTY` placard, if it has one, and then
+    /// its plate, if a vehicle is parked there.
     pub fn cards(&self, scene: &Scene) -> Vec<Card> {
         scene
             .spots
@@ -66,9 +69,10 @@ impl Testbed {
             .collect()
     }
 
-    /// Sign that the vehicle's camera could read at a spot, by the geometry alone: the plate of an occupied spot, the
-    /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly
-    /// hidden. A free spot without a placard can be seen to be free where its plate could be read.
+    /// Sign that the vehicle's camera could read at a spot, by the geometry alone: the plate of an
+    /// occupied spot, the `EMPTY` placard of a free one; `None` when it is outside the image, seen
+    /// from behind, too small in it, or mostly hidden. A free spot without a placard can be seen to
+    /// be free where its plate could be read.
     pub fn sighting(&self, scene: &Scene, cav: &Cav, spot: &Spot) -> Option<Sighting> {
         let place = || Card {
             text: Label::default(),
@@ -123,7 +127,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The spots as the known locations of PACE.
+    /// The spots as landmarks of PACE.
     pub fn landmarks(&self, placard: &Placard) -> Vec<Landmark> {
         self.spots
             .iter()
@@ -148,7 +152,7 @@ pub struct Spot {
 }
 
 impl Spot {
-    /// The spot as a known location, with its `EMPTY` placard as the sign of vacancy.
+    /// The spot as a landmark, with its `EMPTY` placard as the vacancy sign.
     pub fn landmark(&self, placard: &Placard) -> Landmark {
         Landmark {
             id: self.id.clone(),
@@ -205,6 +209,7 @@ pub struct Cav {
 pub struct RecordedRun {
     /// Accuracy of PACE in percent, if it was recorded.
     pub pace_accuracy_pct: Option<f64>,
-    /// Accuracy of each vehicle alone in percent, in the order of the scene's vehicles; those recorded only.
+    /// Accuracy of each vehicle alone in percent, in the order of the scene's vehicles; those
+    /// recorded only.
     pub single_cav_accuracy_pct: Vec<(NodeName, f64)>,
 }

@@ -1,8 +1,10 @@
-//! A town of many cells in virtual time: generated traffic, one aggregator for each cell, and their neighbours' maps.
+//! A town of many cells in virtual time: generated traffic, one aggregator for each cell, and their
+//! neighbours' maps.
 //!
-//! Each vehicle reports to the cell that the core's `CellChoice` gives. Cells send each other their maps, which take their time, come twice,
-//! out of order or never. Each cell has a frame and a clock of its own. The town's map is all maps of one moment together,
-//! each identity once. Beside it, one aggregator gets all reports.
+//! Each vehicle reports to the cell selected by the core's `CellChoice`. Cells send each other
+//! their maps, which are delayed, duplicated, reordered or lost. Each cell has a frame and a clock
+//! of its own. The town's map is the union of all maps of one moment, with each identity once. For
+//! comparison, one aggregator gets all reports.
 
 mod cell;
 mod links;
@@ -49,7 +51,7 @@ pub const BORDER_M: f64 = 25.0;
 /// Time that a vehicle takes to get ready in the next cell; real nodes take 0.6 to 2 s.
 const JOIN_TIME: Duration = Duration::from_secs(1);
 
-/// Time of a map from the moment for which it counts, at most.
+/// Maximum time between a map and the moment that it represents.
 const MOMENT: Duration = Duration::from_millis(75);
 
 /// Links between cells.
@@ -59,11 +61,11 @@ pub struct LinkConfig {
     pub map_hz: f64,
     /// Least time in seconds that a map takes.
     pub min_delay_s: f64,
-    /// Mean time in seconds that it takes beyond.
+    /// Mean additional delay in seconds.
     pub delay_s: f64,
     /// Share of maps that are lost; as many come twice, and as many half a second late.
     pub lost: f64,
-    /// False where cells tell each other nothing.
+    /// False if cells exchange no messages.
     pub is_up: bool,
 }
 
@@ -79,15 +81,15 @@ impl Default for LinkConfig {
     }
 }
 
-/// Accuracy of one way to make the town's map.
+/// Accuracy of one method of making the town's map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TownScores {
     /// Everywhere.
     pub all: TrackScores,
     /// Within [`BORDER_M`] of a border.
     pub border: TrackScores,
-    /// As near to a line through the middle of cells, and not at a border. Where cells have an even number of roads, both
-    /// kinds of lines run between roads.
+    /// At the same distance from a line through the middle of cells, and not at a border. If cells
+    /// have an even number of roads, both kinds of lines run between roads.
     pub middle: TrackScores,
 }
 
@@ -104,11 +106,12 @@ pub struct TownResult {
     pub hand_overs: HandOvers,
     /// Maps that cells received.
     pub received: u64,
-    /// Those of them that did not count.
+    /// Number of the messages that were refused.
     pub refused: u64,
 }
 
-/// A town whose traffic is such that every cell has two or more roads each way, and borders run between roads.
+/// A town whose traffic is such that every cell has two or more roads each way, and borders run
+/// between roads.
 pub fn town_traffic(roads_a_cell: usize, duration_s: f64) -> TrafficConfig {
     let roads = CELLS_A_SIDE * roads_a_cell;
     let share = (roads * (roads - 1)) as f64 / 12.0;
@@ -126,10 +129,11 @@ pub fn town_traffic(roads_a_cell: usize, duration_s: f64) -> TrafficConfig {
     }
 }
 
-/// Runs a recording through one aggregator and through nine; `uniform` gives numbers drawn evenly from [0, 1).
+/// Runs a recording through one aggregator and through nine; `uniform` returns numbers drawn evenly
+/// from [0, 1).
 ///
 /// # Errors
-/// For a recording without truth.
+/// Returns an error for a recording without truth.
 pub fn run(
     traffic: &TrafficConfig,
     recording: &TrafficRecording,
@@ -333,7 +337,7 @@ impl TownVehicle {
     }
 }
 
-/// Place in the town's frame of whoever reports, metres.
+/// Place of the reporting vehicle in the town's frame, in metres.
 fn place_of(report: &ObjectReport) -> Point2<f64> {
     report
         .pose
@@ -393,7 +397,7 @@ fn judge(
     })
 }
 
-/// All objects of all cells at a moment, each identity once: the one that is known best.
+/// All objects of all cells at a moment, each identity once, with its most accurate object.
 fn moment(cells: &[TownCell], at: Timestamp) -> Vec<FusedObject> {
     let mut known: BTreeMap<Uuid, FusedObject> = BTreeMap::new();
     for object in cells.iter().flat_map(|cell| cell.objects_at(at, MOMENT)) {

@@ -1,15 +1,19 @@
-//! Traffic to test and tune with: what moves in a town, what its vehicles report, and what is true.
+//! Generated traffic for testing and tuning: moving objects in a town, the reports of its vehicles,
+//! and the truth.
 //!
-//! Vehicles drive on a grid of roads, follow each other, stop at signals and turn; others are parked; people and
-//! bicycles go around the blocks. Some of the vehicles report what they see. Buildings and vehicles hide what is behind
-//! them; things are missed by range and occlusion; there are false alarms of one frame, some that last, and places that
-//! deceive everyone who passes; positions are noisy, and shifted and turned with the slowly changing error of the
-//! observer's pose; captures are not synchronised, and reports arrive late, out of order, or never.
+//! Vehicles drive on a grid of roads, follow each other, stop at signals and turn; others are
+//! parked; people and bicycles go around the blocks. Some of the vehicles report their detections.
+//! Buildings and vehicles hide objects behind them; objects are missed because of range and
+//! occlusion; there are false alarms of one frame, lasting ones, and places that cause false alarms
+//! for every passing vehicle; positions are noisy, and shifted and turned with the slowly changing
+//! error of the observer's pose; captures are not synchronised, and reports arrive late, out of
+//! order, or are lost.
 //!
-//! The truth has, every tenth of a second, what any observer could see then or [`TrafficConfig::memory_s`] before, and,
-//! where poses are reported, the observers.
+//! The truth contains, every tenth of a second, all objects that any observer could see then or up
+//! to [`TrafficConfig::memory_s`] before and, if poses are reported, the observers.
 //!
-//! Random numbers come from outside: equal numbers give equal traffic. Motion is exact to a hundredth of a second.
+//! Random numbers come from outside: equal numbers give equal traffic. Motion is exact to a
+//! hundredth of a second.
 
 mod config;
 mod dice;
@@ -55,7 +59,7 @@ const MIN_LATENCY_S: f64 = 0.03;
 /// Standard deviation of an observer's clock in seconds.
 const CLOCK_S: f64 = 0.002;
 
-/// Reports and what is true; see the module.
+/// Reports and truth; see the module.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrafficRecording {
     /// In the order of arrival.
@@ -64,10 +68,10 @@ pub struct TrafficRecording {
     pub truth: TrafficTruth,
 }
 
-/// A report and when it arrived, as a line of a recording for [`ecod::replay`].
+/// A report and its time of arrival, as a line of a recording for [`ecod::replay`].
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ArrivedReport {
-    /// When it arrived; absent if reports arrive at once.
+    /// Time of arrival; absent if reports arrive at once.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub received_at_us: Option<Timestamp>,
     /// The report.
@@ -94,7 +98,7 @@ pub struct TruthFrame {
 /// One object at one moment.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TruthObject {
-    /// The same in every frame.
+    /// Constant over all frames.
     pub id: usize,
     /// Its class.
     pub label: &'static str,
@@ -110,7 +114,8 @@ pub fn observer_name(number: usize) -> NodeName {
     NodeName::new(format!("cav-{number}")).expect("letters, a dash and digits are a name")
 }
 
-/// Generates traffic from `uniform`, which gives numbers drawn evenly from [0, 1); `config` is taken as valid.
+/// Generates traffic from `uniform`, which returns numbers drawn evenly from [0, 1); `config` must
+/// be valid.
 pub fn generate(config: &TrafficConfig, uniform: &mut dyn FnMut() -> f64) -> TrafficRecording {
     let dice = &mut Dice(uniform);
     let mut town = Town::new(config, dice);
@@ -125,7 +130,7 @@ pub fn generate(config: &TrafficConfig, uniform: &mut dyn FnMut() -> f64) -> Tra
     watch.finish()
 }
 
-/// All that is there.
+/// The state of the town.
 struct Town {
     roads: Roads,
     buildings: Vec<Building>,
@@ -242,11 +247,11 @@ fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> TrafficBo
     }
 }
 
-/// All observers and what has come of them.
+/// All observers and their results.
 struct Watch<'a> {
     config: &'a TrafficConfig,
     observers: Vec<Watcher>,
-    /// By body, when an observer could see it last.
+    /// By body, the last step at which an observer could see it.
     seen_at: Vec<Option<u64>>,
     arrived: Vec<(Timestamp, ArrivedReport)>,
     truth: TrafficTruth,

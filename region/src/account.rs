@@ -1,4 +1,5 @@
-//! Rights of one cell on a region's broker: it writes below its own tile and name, and reads the tiles around.
+//! Rights of one cell on a region's broker: it writes below its own tile and name, and reads the
+//! tiles around.
 
 use std::fmt::Write;
 
@@ -25,7 +26,7 @@ impl CellAccount {
         }
     }
 
-    /// MQTT filters of what the cell may publish.
+    /// MQTT filters of the topics that the cell may publish.
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let (tile, cell) = (*tile, cell.clone());
@@ -42,9 +43,11 @@ impl CellAccount {
             .collect()
     }
 
-    /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
+    /// MQTT filters of the topics that the cell may read: its own topics, maps and descriptions of
+    /// the tiles around, and reputations.
     ///
-    /// Statuses of others are not among them: they name the runs of nodes, and so what their connections may be called.
+    /// Statuses of other cells are excluded: they contain the runs of nodes, from which the ids of
+    /// their connections could be derived.
     pub fn reads(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
@@ -59,7 +62,7 @@ impl CellAccount {
 
     /// The user as an element of `users` in NATS's configuration.
     ///
-    /// The password stands there as it is; docs/city.md says why.
+    /// The password is stored there in plain text; docs/city.md explains why.
     pub fn nats(&self, password: &str) -> String {
         let list = |filters: Vec<String>| {
             let subjects: Vec<_> = filters

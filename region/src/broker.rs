@@ -40,17 +40,17 @@ pub struct BrokerLogin {
     login: Option<(String, Secret)>,
 }
 
-/// Silence after which the broker is asked whether it is there.
+/// Silence after which the broker is pinged.
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
 
 /// Largest packet in bytes. A larger one cuts the connection.
 const MAX_PACKET_BYTES: usize = 8 << 20;
 
 impl BrokerArguments {
-    /// The login, with all files read.
+    /// Reads all files of the login.
     ///
     /// # Errors
-    /// When a file cannot be read or has not what it should.
+    /// Returns an error if a file cannot be read or lacks the expected content.
     pub fn load(&self) -> anyhow::Result<BrokerLogin> {
         let password = self.password_file.as_deref().map(read_secret).transpose()?;
         let tls = self.ca.as_deref().map(trust).transpose()?;
@@ -81,7 +81,8 @@ impl BrokerLogin {
         }
     }
 
-    /// Options of a connection. Its identity is random: who knows another's may end its connection.
+    /// Options of a connection. The client id is random, because a client with the same id could
+    /// end this connection.
     pub fn options(&self) -> MqttOptions {
         let host = self.address.host();
         // The name in the certificate has no brackets.
@@ -114,7 +115,7 @@ impl BrokerLogin {
 /// The first line of a file.
 ///
 /// # Errors
-/// When it cannot be read or is empty.
+/// Returns an error if it cannot be read or is empty.
 pub fn read_secret(path: &Path) -> anyhow::Result<Secret> {
     let text =
         bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;

@@ -12,7 +12,7 @@ use ecod_actors::cli::{Failure, LogArguments, exit, start_log};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Many cells of ECOD seen together, through the broker of their region
+/// Many cells of ECOD in one view, through the broker of their region
 #[derive(Debug, Parser)]
 #[command(name = "ecod-region", version)]
 struct Cli {
@@ -28,7 +28,7 @@ enum Command {
     Serve(serve::ServeArguments),
     /// Read the maps of a region for some seconds, and write them as GeoJSON or MCAP
     Export(export::ExportArguments),
-    /// Print the account of a cell for the region's broker: what it may write and read
+    /// Print the account of a cell for the region's broker: its write and read permissions
     CellAccount(account::AccountArguments),
 }
 
@@ -49,7 +49,7 @@ pub fn main() -> ExitCode {
     exit("ecod-region", outcome)
 }
 
-/// Runs a future until it ends, or the process is asked to.
+/// Runs a future until it ends, or the process is terminated.
 fn run_until_stopped<T>(
     future: impl Future<Output = anyhow::Result<T>>,
 ) -> Result<Option<T>, Failure> {

@@ -1,4 +1,4 @@
-//! The town in files of others: GeoJSON of one moment, MCAP of a time.
+//! The town in other file formats: GeoJSON of one moment, MCAP of a period.
 
 mod geojson;
 mod log;

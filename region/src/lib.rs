@@ -1,4 +1,4 @@
-//! Many cells seen together: reads what cells tell on their region's broker.
+//! A joint view of many cells: reads the messages of cells on their region's broker.
 //!
 //! Rooms by floor, the top first; imports run downward only:
 //!

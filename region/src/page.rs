@@ -23,7 +23,7 @@ use metrics::PageCounts;
 use routes::RegionApi;
 use viewers::Viewers;
 
-/// The page of a region, which listens.
+/// The page of a region, with its listening socket.
 #[derive(Debug)]
 pub struct RegionPage {
     listener: TcpListener,
@@ -38,14 +38,14 @@ pub const DEFAULT_ADDRESS: &str = "127.0.0.1:8090";
 /// Maximum number of connections. A browser opens one a second, briefly.
 const MAX_CONNECTIONS: usize = 64;
 
-/// Time between two looks at what has grown old.
+/// Time between two removals of outdated state.
 const UPKEEP_PERIOD: Duration = Duration::from_secs(1);
 
 impl RegionPage {
-    /// Listens; the maps of the tiles of `watched` are always asked for.
+    /// Starts to listen; the maps of the tiles of `watched` are always read.
     ///
     /// # Errors
-    /// When nothing can listen at the address.
+    /// Returns an error if the address cannot be bound.
     pub async fn listen(
         address: SocketAddr,
         token: Option<&Secret>,
@@ -84,7 +84,7 @@ impl RegionPage {
     }
 }
 
-/// Asks no more for tiles that nobody looks at, and forgets their maps.
+/// Stops reading tiles that are out of view, and drops their maps.
 async fn upkeep(api: &RegionApi) {
     loop {
         let now: Timestamp = clock::now();

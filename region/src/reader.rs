@@ -1,4 +1,4 @@
-//! The connection to a region's broker: reads the tiles that somebody looks at, and the status of every cell.
+//! The connection to a region's broker: reads the tiles in view, and the status of every cell.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -29,15 +29,15 @@ pub struct RegionState {
 /// The connection, as an operator sees it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct BrokerLink {
-    /// True while the broker lets the reader in.
+    /// True while the reader is logged in at the broker.
     pub is_up: bool,
     /// Number of logins so far.
     pub logins: u64,
-    /// The reason why it is not, or filters that the broker refuses.
+    /// The reason why it is not logged in, or the filters that the broker refuses.
     pub trouble: Option<String>,
 }
 
-/// A message, and what became of it.
+/// A message and its outcome.
 #[derive(Debug)]
 pub struct Reading<'a> {
     /// Its topic.
@@ -71,12 +71,12 @@ impl RegionState {
         lock(&self.link).clone()
     }
 
-    /// The tiles whose maps are read; none while there is no connection.
+    /// The tiles whose maps are read; empty while there is no connection.
     pub fn tiles(&self) -> ReadTiles {
         lock(&self.read).clone()
     }
 
-    /// Asks for the maps of these tiles and of no others. None of them may be in another.
+    /// Sets the tiles whose maps are read. They must not contain each other.
     pub fn ask(&self, tiles: BTreeSet<Quadkey>) {
         self.tiles.send_if_modified(|asked| {
             let is_news = *asked != tiles;
@@ -86,7 +86,7 @@ impl RegionState {
     }
 }
 
-/// Reads without end; `seen` is told of every message. A connection that is lost is made anew.
+/// Reads without end; `seen` is called for every message. A lost connection is re-established.
 pub async fn read(
     login: &BrokerLogin,
     state: &Arc<RegionState>,
@@ -107,7 +107,7 @@ pub async fn read(
 /// Filters of each subscription that waits for its answer, in order.
 type Asked = Mutex<VecDeque<Vec<String>>>;
 
-/// Keeps the subscriptions as the tiles that are asked for.
+/// Keeps the subscriptions equal to the requested tiles.
 async fn subscribe(
     client: AsyncClient,
     state: &RegionState,
@@ -155,7 +155,7 @@ async fn subscribe(
             let _ = client.subscribe_many(filters).await;
         }
         present = wanted;
-        // A connection that ended meanwhile reads nothing.
+        // A connection that ended in the meantime reads no more messages.
         let link = lock(&state.link);
         if link.is_up {
             lock(&state.read).replace(asked_tiles.into_iter(), clock::now());

@@ -23,7 +23,7 @@ use ecod_actors::platform::throttle::KeyedThrottle;
 pub use read_tiles::ReadTiles;
 pub use snapshot::{ObjectView, TileView, TownCellView, TownTotals, TownView};
 
-/// Cells by tile and name, and what came of them.
+/// Cells by tile and name, and counts of their messages.
 #[derive(Debug)]
 pub struct RegionTown {
     cells: BTreeMap<(Quadkey, NodeName), RegionCell>,
@@ -37,11 +37,11 @@ pub struct RegionTown {
 pub struct RegionCell {
     /// The status of its leader.
     pub status: Option<NodeStatus>,
-    /// Since when it says that it is not offline.
+    /// Time since which its status is not offline.
     pub leads_since: Timestamp,
     /// Version of the settings that its nodes share.
     pub description: Option<u64>,
-    /// Its newest map that counts.
+    /// Its newest accepted map.
     pub map: Option<TownMap>,
     /// Its messages and objects that were not used.
     pub losses: CellLosses,
@@ -52,13 +52,13 @@ pub struct RegionCell {
 pub struct CellLosses {
     /// Messages beyond [`MAX_MAP_HZ`].
     pub throttled: u64,
-    /// Objects outside of what the cell may tell of.
+    /// Objects outside of the area that the cell may report.
     pub outside: u64,
     /// Objects beyond the maximum number.
     pub too_many: u64,
 }
 
-/// A map that counts, as far as it is shown.
+/// The shown part of an accepted map.
 #[derive(Debug)]
 pub struct TownMap {
     /// The place on Earth of its frame.
@@ -69,11 +69,11 @@ pub struct TownMap {
     pub epoch: u64,
     /// Number of the map in it.
     pub round: u64,
-    /// The objects of which the cell may tell, without contributors and scores.
+    /// The objects that the cell may report, without contributors and scores.
     pub objects: Vec<FusedObject>,
     /// When it was fused, by the cell's time.
     pub fused_at: Timestamp,
-    /// When it was sent, by this program's clock: the time of receipt less what delayed it.
+    /// Time of sending by this program's clock: the time of receipt minus the delay.
     pub sent_at: Timestamp,
 }
 
@@ -86,13 +86,13 @@ pub struct TownCounts {
     pub bytes: u64,
     /// Maps that count.
     pub maps: u64,
-    /// Messages that do not count, by reason; maps that are too old are `Stale`.
+    /// Refused messages, by reason; maps that are too old are `Stale`.
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Messages and objects of all cells that were not used.
     pub losses: CellLosses,
 }
 
-/// The reason why a message does not count.
+/// The reason why a message is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CellRefusal {
     /// It cannot be used.
@@ -110,7 +110,7 @@ impl From<RejectReason> for CellRefusal {
 /// A message that counts.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Accepted {
-    /// A map, and its delay beyond the least that maps of its cell take.
+    /// A map, and its delay in excess of the least delay of its cell's maps.
     Map(RegionTopic, Duration),
     /// A status or a description.
     Other(RegionTopic),
@@ -121,11 +121,12 @@ pub enum Accepted {
 pub enum CellState {
     /// Its newest map is no older than [`MAX_AGE`].
     Live,
-    /// It says that it leads. Its maps are not read, or not for long enough to know more.
+    /// Its status claims a leader, but its maps are not read, or not for long enough for a
+    /// conclusion.
     Told,
-    /// It says that it leads, and no map comes although one is due.
+    /// Its status claims a leader, but no map arrives although one is due.
     Silent,
-    /// It says that it is offline.
+    /// Its status is offline.
     Offline,
 }
 
@@ -156,8 +157,8 @@ const MAX_STATUS_BYTES: usize = 16 << 10;
 /// Maximum number of objects of a cell that are kept: 0.6 MB.
 const MAX_OBJECTS: usize = 2048;
 
-/// Time for which maps are read before a cell without any is silent. A map counts 2 s after the subscription at the latest: the
-/// first ones show how long maps of the cell take.
+/// Time for which maps are read before a cell without any counts as silent. A map is accepted 2 s
+/// after the subscription at the latest, because the first maps show the cell's usual delay.
 const DUE_AFTER: Duration = Duration::from_secs(3);
 
 impl Default for RegionTown {
@@ -173,10 +174,10 @@ impl Default for RegionTown {
 }
 
 impl RegionTown {
-    /// Takes a message that was read at `now` by a steady clock.
+    /// Processes a message that was read at `now` by a steady clock.
     ///
     /// # Errors
-    /// The reason why it does not count; it is counted.
+    /// Returns the reason why the message is refused, which is also counted.
     pub fn accept(
         &mut self,
         path: &str,
@@ -212,7 +213,7 @@ impl RegionTown {
             );
             return Err(CellRefusal::CellThrottled);
         }
-        // A cell that clears what it retained has left for good.
+        // A cell that clears its retained messages has left for good.
         if payload.is_empty() && topic.kind != RegionTopicKind::Map {
             if topic.kind == RegionTopicKind::Status {
                 self.cells.remove(&key);
@@ -250,7 +251,7 @@ impl RegionTown {
         Ok(Accepted::Other(topic))
     }
 
-    /// Counts what is not used, for its cell and for all.
+    /// Counts refused messages and objects, for its cell and for all.
     fn lose(&mut self, key: &(Quadkey, NodeName), losses: CellLosses) {
         self.counts.losses.add(losses);
         if let Some(cell) = self.cells.get_mut(key) {
@@ -268,7 +269,7 @@ impl RegionTown {
         &self.counts
     }
 
-    /// Drops maps that are old, as those of tiles that nobody looks at any more.
+    /// Drops outdated maps, for example of tiles that are out of view.
     pub fn forget_old_maps(&mut self, now: Timestamp) {
         self.filter.forget_silent(now);
         for cell in self.cells.values_mut() {

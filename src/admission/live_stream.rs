@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use crate::model::time::Timestamp;
 
-/// Candidate for the clock of a sender whose stamps do not fit what is known.
+/// Candidate for the clock of a sender whose stamps contradict the present estimate.
 ///
-/// Messages that waited in a queue arrive faster than they were made. A stream that keeps its delay for a second is
-/// live, whatever its clock says.
+/// Messages that waited in a queue arrive faster than they were made. A stream that keeps its delay
+/// for a second is live, even if its clock is wrong.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct LiveStream {
     since: Timestamp,
@@ -18,8 +18,9 @@ pub struct LiveStream {
 }
 
 impl LiveStream {
-    /// Takes the next message. Returns the least delay in microseconds once the stream in `candidate` is live; a delay
-    /// that moved by more than `tolerance_us` begins a new one.
+    /// Processes the next message. Returns the least delay in microseconds once the stream in
+    /// `candidate` is live. A delay that changed by more than `tolerance_us` starts a new
+    /// candidate.
     pub fn observe(
         candidate: &mut Option<Self>,
         stamp: Timestamp,
@@ -28,7 +29,7 @@ impl LiveStream {
     ) -> Option<i64> {
         let delay_us = received_at.micros_from(stamp);
         match candidate {
-            // A duplicate proves nothing.
+            // A duplicate carries no information.
             Some(stream) if stream.last_stamp == stamp => return None,
             Some(stream)
                 if stamp > stream.last_stamp

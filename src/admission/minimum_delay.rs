@@ -6,8 +6,9 @@ use crate::model::time::Timestamp;
 
 /// The minimum delay from sending to receipt over the last one to two spans.
 ///
-/// The minimum is the clock offset plus the shortest transit; any delay above it is queueing (Moon, Skelly, Towsley,
-/// "Estimation and removal of clock skew", INFOCOM 1999). Unlike there, skew within a span is neglected.
+/// The minimum is the clock offset plus the shortest transit; any delay above it is queueing (Moon,
+/// Skelly, Towsley, "Estimation and removal of clock skew", INFOCOM 1999). Unlike there, skew
+/// within a span is neglected.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct MinimumDelay {
     span: Duration,
@@ -34,7 +35,8 @@ impl MinimumDelay {
         }
     }
 
-    /// Takes the delay of one message in microseconds, which is negative if the sender's clock is ahead.
+    /// Takes the delay of one message in microseconds, which is negative if the sender's clock is
+    /// ahead.
     pub fn observe(&mut self, delay_us: i64, now: Timestamp) {
         if now.since(self.span_start) >= self.span {
             self.previous_us = self.current_us;

@@ -1,4 +1,4 @@
-//! Recent reports: each comes by several brokers.
+//! Recent reports, for detecting duplicates: each report arrives over several brokers.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -10,14 +10,15 @@ use crate::wire::{ObjectReport, ReportKind};
 #[derive(Debug, Default)]
 pub struct RecentReports(BTreeMap<(NodeName, ReportKind), VecDeque<(Timestamp, u64)>>);
 
-/// Reports of one vehicle and kind that are remembered: what two links may lie apart.
+/// Number of stored reports of one vehicle and kind, which covers the time difference between two
+/// links.
 const REMEMBERED: usize = 16;
 
-/// Vehicles and kinds; beyond them, all are forgotten.
+/// Maximum number of vehicles and kinds; when it is exceeded, all entries are dropped.
 const MAX_SENDERS: usize = 8192;
 
 impl RecentReports {
-    /// Remembers a report; false if it came before.
+    /// Records a report; returns false if it arrived before.
     pub fn is_new(&mut self, kind: ReportKind, report: &ObjectReport) -> bool {
         let (sender, mark) = (
             (report.node.clone(), kind),

@@ -1,15 +1,19 @@
 //! Admission of reports: each fresh report once, with its capture time on the aggregator's clock.
 //!
-//! Call [`ReportWindow::admit`] with every decoded report. An admitted report may be fused once; a rejected one changes
-//! at most the estimate of the vehicle's clock. A report that a later one of its vehicle overtook is admitted once as
-//! [`Admitted::OutOfOrder`], for algorithms that can go back in time.
+//! Call [`ReportWindow::admit`] with every decoded report. An admitted report may be fused once; a
+//! rejected one changes at most the estimate of the vehicle's clock. A report that was overtaken by
+//! a later report of its vehicle is admitted once as [`Admitted::OutOfOrder`], for algorithms that
+//! can go back in time.
 //!
-//! - A report that states its [clock error](ObjectReport::clock_error_us) is stamped in the cell's time. Its age is known.
-//! - The clock of any other sender is estimated from its least delay. An offset beyond `max_clock_offset_s`, or a step, is
-//!   believed once the stream has been live for a second ([`LiveStream`](crate::admission::live_stream::LiveStream)).
+//! - A report that states its [clock error](ObjectReport::clock_error_us) is stamped in the cell's
+//!   time, so its age can be computed directly.
+//! - The clock of any other sender is estimated from its least delay. An offset beyond
+//!   `max_clock_offset_s`, or a step, is accepted once the stream has been live for a second
+//!   ([`LiveStream`](crate::admission::live_stream::LiveStream)).
 //!
-//! One wrong timestamp does not silence its vehicle. A report that is ahead of all before by more than half of
-//! `max_age_s` is rejected unless the next one agrees. A first report that the second contradicts is forgotten.
+//! One wrong timestamp does not silence its vehicle. A report that is ahead of all before by more
+//! than half of `max_age_s` is rejected unless the next one agrees. A first report that the second
+//! one contradicts is dropped.
 
 mod vehicle_clock;
 
@@ -29,12 +33,15 @@ config_section! {
     /// Admission of reports by age and clock.
     #[derive(JsonSchema)]
     pub struct WindowConfig {
-        /// Age in seconds beyond which a report is stale. Default 1.0; higher bridges slower links, lower forgets sooner.
+        /// Age in seconds beyond which a report is stale. Default 1.0. A higher value tolerates
+        /// slower links; a lower value drops objects sooner.
         pub max_age_s: f64 = 1.0, in 0.01 to 3600.0;
-        /// Offset in seconds from the cell's time up to which a clock is believed at once. Default 2.0. A stream with a
-        /// larger one is rejected for a second, until it is known to be live. Every offset is estimated and removed.
+        /// Offset in seconds from the cell's time up to which a clock is accepted at once. Default
+        /// 2.0. A stream with a larger offset is rejected for a second, until it has proven to be
+        /// live. Every offset is estimated and removed.
         pub max_clock_offset_s: f64 = 2.0, in 0.0 to 3600.0;
-        /// Clock offset in seconds up to which clocks count as synchronised and nothing is removed. Default 0.05.
+        /// Clock offset in seconds up to which a clock counts as synchronised and is not corrected.
+        /// Default 0.05.
         pub clock_tolerance_s: f64 = 0.05, in 0.0 to *max_clock_offset_s;
         /// Maximum number of vehicles. Default 4096.
         pub max_vehicles: usize = 4096, in 1.0 to 1e6;
@@ -46,18 +53,18 @@ config_section! {
 pub enum Admitted {
     /// The vehicle's latest so far.
     InOrder(Timestamp),
-    /// A later one of the vehicle was admitted before.
+    /// A later report of the vehicle was admitted before.
     OutOfOrder(Timestamp),
 }
 
 /// Faults of a sender whose reports are admitted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct SenderState {
-    /// Time for which none of its objects has been where it has an effect.
+    /// Time for which all objects of the sender have been where they have no effect.
     pub(crate) misplaced: Duration,
     /// True if another sender uses its name.
     pub(crate) is_shared: bool,
-    /// True if it states that it does not move, and has lately moved.
+    /// True if the sender states that it does not move, and has recently moved.
     pub(crate) has_moved: bool,
 }
 
@@ -65,7 +72,8 @@ pub(crate) struct SenderState {
 #[derive(Debug, Clone)]
 pub struct ReportWindow {
     config: WindowConfig,
-    /// The cell's time less the aggregator's clock in microseconds, and the same before it last jumped.
+    /// The cell's time minus the aggregator's clock in microseconds, and the same offset before its
+    /// last jump.
     cell_offset_us: i64,
     offset_before_us: Option<i64>,
     vehicles: BTreeMap<NodeName, VehicleClock>,
@@ -82,13 +90,13 @@ impl ReportWindow {
         }
     }
 
-    /// Goes on under other settings.
+    /// Applies new settings.
     pub(crate) fn configure(&mut self, config: WindowConfig) {
         self.config = config;
     }
 
-    /// Notes the cell's time less the aggregator's clock in microseconds. After a jump, vehicles that have not heard of it
-    /// are still understood.
+    /// Sets the cell's time minus the aggregator's clock in microseconds. After a jump, reports
+    /// stamped in the previous cell time are still accepted.
     pub fn set_cell_offset(&mut self, offset_us: i64) {
         let change = offset_us.saturating_sub(self.cell_offset_us);
         if change.saturating_abs() > seconds(self.config.max_age_s) {
@@ -107,8 +115,9 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees with), [`RejectReason::Stale`],
-    /// [`RejectReason::OutOfOrder`] for certain and possible duplicates, or [`RejectReason::TooManyVehicles`].
+    /// Returns [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees
+    /// with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] for certain and possible
+    /// duplicates, or [`RejectReason::TooManyVehicles`].
     pub fn admit(
         &mut self,
         report: &ObjectReport,
@@ -140,7 +149,7 @@ impl ReportWindow {
         admitted
     }
 
-    /// Time for which a sender's reports have been rejected for their time, and nothing else.
+    /// Time for which a sender's reports have been rejected because of their time only.
     pub fn untimely_for(&self, name: &NodeName, now: Timestamp) -> Duration {
         let since = self
             .vehicles
@@ -149,7 +158,7 @@ impl ReportWindow {
         since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
-    /// The state of a sender; without faults if it is not known.
+    /// The state of a sender; without faults if there are no records of it.
     pub(crate) fn sender(&self, name: &NodeName, now: Timestamp) -> SenderState {
         let Some(vehicle) = self.vehicles.get(name) else {
             return SenderState::default();
@@ -167,16 +176,16 @@ impl ReportWindow {
         }
     }
 
-    /// Notes if any object of a known sender's report has an effect where it is.
+    /// Records whether any object of a sender's report has an effect where it is.
     pub(crate) fn note_place(&mut self, name: &NodeName, is_placed: bool, at: Timestamp) {
         if let Some(vehicle) = self.vehicles.get_mut(name) {
             vehicle.misplaced_since = (!is_placed).then(|| vehicle.misplaced_since.unwrap_or(at));
         }
     }
 
-    /// The share of the vehicles heard lately whose reports are admitted.
+    /// The share of recently active vehicles whose reports are admitted.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
-        // By vehicle: the parts of one must not speak for many.
+        // Counted by vehicle, so that one vehicle with many parts has the weight of one vehicle.
         let mut vehicles = BTreeMap::new();
         for (name, vehicle) in self
             .vehicles
@@ -195,7 +204,7 @@ impl ReportWindow {
         }
     }
 
-    /// The vehicles that were heard lately, once for each part.
+    /// The vehicles that were active recently, once for each part.
     pub(crate) fn present(&self, now: Timestamp) -> impl Iterator<Item = NodeName> {
         let present = self
             .vehicles
@@ -221,7 +230,7 @@ impl ReportWindow {
     }
 }
 
-/// Number of parts of the same vehicle, if the name is that of a part.
+/// Number of other parts of the same vehicle, if the name belongs to a part.
 fn parts_beside(vehicles: &BTreeMap<NodeName, VehicleClock>, name: &NodeName) -> usize {
     let vehicle = name.vehicle();
     if vehicle == *name {
@@ -235,16 +244,20 @@ fn parts_beside(vehicles: &BTreeMap<NodeName, VehicleClock>, name: &NodeName) ->
         .count()
 }
 
-/// Maximum parts of a vehicle at a time: a vehicle that invents names takes nobody else's room.
+/// Maximum number of parts of a vehicle at a time, so that a vehicle that invents names takes no
+/// room from others.
 pub const MAX_PARTS: usize = 16;
 
-/// Time after which a silent vehicle has left: its clock is forgotten when room is short.
+/// Time after which a silent vehicle counts as having left: its clock is dropped when room is
+/// short.
 const RETENTION: Duration = Duration::from_secs(10);
 
-/// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that stepped takes one second.
+/// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that
+/// stepped takes one second.
 const UNTIMELY_TIME: Duration = Duration::from_secs(3);
 
-/// Time for which a sender that states that it does not move has lately moved.
+/// Time after a movement for which a sender that states that it does not move counts as having
+/// moved.
 const MOVED_LATELY: Duration = Duration::from_secs(10);
 
 fn seconds(s: f64) -> i64 {

@@ -1,14 +1,15 @@
 //! One answer for each place where PACE and VOTE both run.
 //!
-//! PACE says whether an object is there: it alone counts misses. VOTE says what it is: it alone knows whom to trust. Its
-//! label stands, however narrow the vote, unless PACE knows that the place is empty. Both rest on the same frames, so that
-//! neither adds certainty to the other: the answer is as sure as the less sure of them.
+//! PACE decides whether there is an object, because only PACE counts misses. VOTE decides which
+//! label it has, because only VOTE weighs vehicles by reputation. VOTE's label is used even after a
+//! narrow vote, unless PACE has determined that the place is empty. Both use the same frames, so
+//! they don't add certainty to each other: the confidence of the answer is the lower of the two.
 
 use crate::model::names::Label;
 use crate::wire::{LabelReading, LandmarkState, Verdict};
 
-/// Combines the state of a place by PACE with its verdict and with what each vehicle read there. `sign` is the label of
-/// the place's vacancy sign.
+/// Combines the state of a place by PACE with its verdict and with each vehicle's reading there.
+/// `sign` is the label of the place's vacancy sign.
 pub(super) fn agree(
     mut state: LandmarkState,
     verdict: Option<&Verdict>,
@@ -25,7 +26,8 @@ pub(super) fn agree(
         match &state.label {
             Some(known) if known == label => state.confidence = state.confidence.min(share),
             known => {
-                // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
+                // Without PACE, a few voters don't give certainty: Laplace's rule of succession for
+                // votes that all agree.
                 let sure = if known.is_some() {
                     state.confidence
                 } else {
@@ -38,7 +40,7 @@ pub(super) fn agree(
             }
         }
     }
-    // Where all read the place's label, the contributors say as much.
+    // If all vehicles read the place's label, the list of contributors has the same information.
     let is_unanimous =
         matches!(&readings[..], [reading] if Some(&reading.label) == state.label.as_ref());
     state.readings = if is_unanimous { Vec::new() } else { readings };

@@ -1,5 +1,5 @@
-//! The calls that an aggregator gets beside reports, as values. Commands, reports and the times of both are enough to
-//! run it again.
+//! The aggregator's inputs other than reports, as values. Commands, reports and their times are
+//! sufficient to replay an aggregator.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -38,7 +38,7 @@ pub enum Command {
     StepDown,
     /// [`Aggregator::adopt`].
     Adopt {
-        /// All known evidence.
+        /// All available evidence.
         #[schemars(with = "serde_json::Value")]
         ledger: Arc<ReputationLedger>,
     },
@@ -53,12 +53,12 @@ pub enum Command {
     TakeNeighbours {
         /// All objects of other cells near this one; their times are by the aggregator's clock.
         objects: Arc<[NeighbourObject]>,
-        /// When they were of the age that they state.
+        /// Time at which the objects had the ages that they state.
         stated_at: Timestamp,
     },
     /// [`Aggregator::take_foreign`].
     TakeForeign {
-        /// All that other cells say of the vehicles that are present.
+        /// All counts of other cells about the present vehicles.
         #[schemars(with = "serde_json::Value")]
         reputations: Arc<ForeignReputations>,
     },
@@ -72,13 +72,13 @@ pub enum Command {
         /// Settings of fusion.
         #[schemars(with = "serde_json::Value")]
         fusion: Box<FusionConfig>,
-        /// Known locations.
+        /// The cell's landmarks.
         #[schemars(with = "serde_json::Value")]
         landmarks: Vec<LandmarkConfig>,
     },
     /// [`Aggregator::set_cell_offset`].
     SetCellOffset {
-        /// The cell's time less the aggregator's clock in microseconds.
+        /// The cell's time minus the aggregator's clock in microseconds.
         offset_us: i64,
     },
 }

@@ -39,8 +39,8 @@ impl Algorithms {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
-    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts with the first vote.
-    /// Reports for an algorithm that does not run are rejected.
+    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts
+    /// with the first vote. Reports for an algorithm that does not run are rejected.
     pub algorithms: Algorithms,
     /// Admission of reports by age and clock.
     pub window: WindowConfig,
@@ -48,7 +48,7 @@ pub struct FusionConfig {
     pub round: RoundConfig,
     /// Parameters of PACE.
     pub pace: PaceConfig,
-    /// Parameters of tracking: the objects in maps that are at no known location.
+    /// Parameters of tracking, which produces the objects in maps that are not at a landmark.
     pub tracks: TracksConfig,
     /// Parameters of VOTE.
     pub vote: VoteConfig,
@@ -57,7 +57,7 @@ pub struct FusionConfig {
 }
 
 impl FusionConfig {
-    /// True if objects are tracked in a cell with or without known locations.
+    /// True if objects are tracked in a cell with or without landmarks.
     pub fn tracks_objects(&self, has_landmarks: bool) -> bool {
         let is_wanted = match self.tracks.mode {
             TracksMode::Auto => !has_landmarks,
@@ -67,7 +67,7 @@ impl FusionConfig {
         self.algorithms.pace() && is_wanted
     }
 
-    /// True if rounds yield evidence about vehicles in a cell with or without known locations.
+    /// True if rounds yield evidence about vehicles in a cell with or without landmarks.
     pub fn rates_vehicles(&self, has_landmarks: bool) -> bool {
         self.algorithms.vote() || self.tracks_objects(has_landmarks)
     }
@@ -75,7 +75,7 @@ impl FusionConfig {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.window
             .validate()

@@ -11,29 +11,30 @@ use crate::tracking::Tracker;
 use crate::vote::Vote;
 use crate::wire::ForeignVotes;
 
-/// The counts of other cells as last told, and the trust in those cells.
+/// The latest counts of other cells, and the trust in those cells.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForeignView {
     reputations: Arc<ForeignReputations>,
-    /// Trust in each cell, 0 to 1, by which votes and tracks weigh them at present; none if they do not yet.
+    /// Trust in each cell, 0 to 1, that votes and tracks currently use; `None` if they have not
+    /// been set yet.
     trust: Option<BTreeMap<NodeName, f64>>,
-    /// True if what counts has changed since it was asked for.
+    /// True if the effective counts have changed since they were last read.
     is_news: bool,
 }
 
 impl ForeignView {
-    /// Takes all that is known.
+    /// Replaces all counts.
     pub(super) fn set(&mut self, reputations: &Arc<ForeignReputations>) {
         (self.reputations, self.trust) = (Arc::clone(reputations), None);
     }
 
-    /// Has votes and tracks told again: they may have begun anew.
+    /// Makes the next call of `weigh` update votes and tracks, because they may have restarted.
     pub(super) fn repeat(&mut self) {
         self.trust = None;
     }
 
-    /// Tells votes and tracks, if anything or the trust in any cell has changed. A cell of which tracks know nothing is
-    /// trusted as a newcomer is.
+    /// Updates votes and tracks if the counts or the trust in any cell have changed. A cell without
+    /// a track record is trusted like a newcomer.
     pub(super) fn weigh(&mut self, vote: Option<&mut Vote>, tracks: Option<&mut Tracker>) {
         let of_cell = |cell: &NodeName| {
             tracks
@@ -58,7 +59,8 @@ impl ForeignView {
         }
     }
 
-    /// The votes beside the prior of published reputations, if they have changed since the last call.
+    /// The votes of other cells for published reputations, if they have changed since the last
+    /// call.
     pub(super) fn take_news(
         &mut self,
         prior_votes: f64,
@@ -78,17 +80,19 @@ impl ForeignView {
 }
 
 impl Aggregator {
-    /// Takes all that other cells say of vehicles. It moves the trust from which they start, from the next round on.
+    /// Replaces all counts of other cells about vehicles. From the next round on, they change the
+    /// reputation with which the vehicles start.
     pub fn take_foreign(&mut self, reputations: &Arc<ForeignReputations>) {
         self.foreign.set(reputations);
     }
 
-    /// The votes of other cells beside the prior of published reputations, if they have changed since the last call.
+    /// The votes of other cells for published reputations, if they have changed since the last
+    /// call.
     pub fn take_foreign_news(&mut self) -> Option<BTreeMap<NodeName, ForeignVotes>> {
         self.foreign.take_news(self.initial_votes)
     }
 
-    /// The vehicles that are present: those heard in the last ten seconds.
+    /// The present vehicles: those that were active in the last ten seconds.
     pub fn present(&self, now: Timestamp) -> BTreeSet<NodeName> {
         self.windows
             .iter()

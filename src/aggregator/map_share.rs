@@ -1,15 +1,18 @@
-//! The share of one vehicle in the map: objects that no other vehicle sees take a bounded part of it.
+//! The share of one vehicle in the map: objects that no other vehicle sees take a bounded part of
+//! it.
 
 use std::collections::BTreeMap;
 
 use crate::model::names::NodeName;
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
-/// Maximum number of objects in a map that one vehicle alone has reported, its parts together: as many as one report may
-/// have. A map without this bound grows with the reports of one member until links no longer carry it in a round.
+/// Maximum number of objects in a map that only one vehicle has reported, including its parts: as
+/// many as one report may have. Without this bound, one member's reports could make the map too
+/// large for the links to carry once per round.
 pub const MAX_SOLE_OBJECTS: usize = 1024;
 
-/// Removes the objects beyond each vehicle's share, the least certain first, and returns what was removed.
+/// Removes the objects beyond each vehicle's share, the least certain first, and returns the
+/// removed entries.
 pub(super) fn limit_shares(objects: &mut Vec<FusedObject>) -> Vec<InvalidEntry> {
     if objects.len() <= MAX_SOLE_OBJECTS {
         return Vec::new();
@@ -23,7 +26,8 @@ pub(super) fn limit_shares(objects: &mut Vec<FusedObject>) -> Vec<InvalidEntry> 
                 .push(object.confidence);
         }
     }
-    // The confidence that objects of a vehicle must exceed, and how many with just this one have room.
+    // The confidence that objects of a vehicle must exceed, and the number of objects with exactly
+    // this confidence that are kept.
     let mut bounds: BTreeMap<NodeName, (f64, usize)> = BTreeMap::new();
     for (vehicle, mut of_vehicle) in confidences {
         if of_vehicle.len() > MAX_SOLE_OBJECTS {

@@ -17,11 +17,11 @@ const SAME_PLACE_M: f64 = 4.0;
 /// Error in seconds of the ages of maps.
 const CLOCK_ERROR_S: f64 = 0.2;
 
-/// The objects of other cells near this one, as last told.
+/// The objects of other cells near this cell, as last received.
 #[derive(Debug, Clone, Default)]
 pub(super) struct NeighbourView {
     objects: Arc<[NeighbourObject]>,
-    /// When they were of the age that they state.
+    /// Time at which the objects had the ages that they state.
     stated_at: Timestamp,
 }
 
@@ -30,8 +30,10 @@ impl NeighbourView {
         Self { objects, stated_at }
     }
 
-    /// Those that are not too old at `now`, believed, and none of this cell's `own` objects. Cells that tell of one object are
-    /// heard once. Cells that use one identity for different places are both heard: none of them hides the other's object.
+    /// Returns the objects that are recent enough at `now`, credible, and different from this
+    /// cell's `own` objects. Several cells that report one object count as one. If cells use one
+    /// identity for different places, both objects are kept, so that neither cell can hide the
+    /// other's object.
     pub(super) fn shown(
         &self,
         own: &[FusedObject],
@@ -65,7 +67,8 @@ impl NeighbourView {
     }
 }
 
-/// True if two statements can be of one object, by the lower speed and their ages; `age_s` is that of the second.
+/// True if two statements can refer to one object, considering the lower speed and their ages;
+/// `age_s` is the age of the second statement.
 fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
     let [a, b] = [&told.object, &stated.object];
     let speeds = [a, b].map(|object| {

@@ -1,4 +1,4 @@
-//! Doubts about reports that are used all the same.
+//! Doubts about reports that are used nevertheless.
 
 use std::fmt;
 use std::time::Duration;
@@ -8,27 +8,29 @@ use nalgebra::Point2;
 use crate::model::geometry::Pose;
 use crate::wire::ObjectReport;
 
-/// Time for which no object of a vehicle has an effect where it is until that is a doubt: it may see something else.
+/// Time for which a vehicle's objects must all be without effect before this counts as a doubt: the
+/// vehicle may see other things.
 pub(super) const MIN_MISPLACED: Duration = Duration::from_secs(10);
 
-/// Distance in metres from the known locations, beside their extent, beyond which a cell tracks no objects.
+/// Distance in metres from the landmarks, in addition to their extent, beyond which a cell tracks
+/// no objects.
 pub(super) const MAX_AWAY_M: f64 = 200.0;
 
-/// Greatest range in metres at which a camera tells what an object is.
+/// Maximum range in metres at which a camera can recognise an object.
 const MAX_SEEN_RANGE_M: f64 = 300.0;
 
 /// A doubt about the reports of a vehicle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ReportDoubt {
-    /// An object is farther from the camera than any can be seen: positions are in another unit.
+    /// An object is farther from the camera than a camera can see: positions are in another unit.
     FarObject {
         /// Its range in metres.
         range_m: f64,
     },
-    /// For ten seconds no object has been at a known location or, where objects are tracked, near one: positions are in
-    /// another unit or frame.
+    /// For ten seconds all objects have been away from the landmarks or, if objects are tracked,
+    /// not even near a landmark: positions are in another unit or frame.
     NoObjectAtLocation,
-    /// It states that it does not move, and its pose does.
+    /// The vehicle states that it does not move, but its pose changes.
     Moves,
     /// Two senders report under the name: their numbers go back and forth.
     SharedName,

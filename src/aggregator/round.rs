@@ -1,15 +1,18 @@
-//! The trigger of rounds: a round closes every period, or as soon as every live vehicle has reported.
+//! The trigger of rounds: a round closes every period, or as soon as every live vehicle has
+//! reported.
 //!
 //! - The first rounds of a leadership without handover follow each other more quickly.
 //! - A round waits for both reports of a vehicle that sends both kinds.
-//! - A vehicle that reports less often than rounds close is waited for in the rounds in which its next report is expected.
-//! - Vehicles often report once a period, all at about the same time, and just as a round ends. If it ended amid their
-//!   reports, the later ones would wait for another period, in every round. So the end is delayed a little while reports
-//!   come in. If a round ends amid them nevertheless, the rest get a round as soon as the last of them has reported;
-//!   later rounds then end after all of them.
+//! - A vehicle that reports less often than rounds close is waited for in the rounds in which its
+//!   next report is expected.
+//! - Vehicles often report once a period, all at about the same time, and just as a round ends. If
+//!   it ended amid their reports, the later ones would wait for another period, in every round. So
+//!   the end is delayed a little while reports come in. If a round ends amid them nevertheless, the
+//!   rest get a round as soon as the last of them has reported; later rounds then end after all of
+//!   them.
 //!
-//! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at [`RoundTrigger::deadline`];
-//! either returns true when the round closes.
+//! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at
+//! [`RoundTrigger::deadline`]; either returns true when the round closes.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -37,10 +40,10 @@ config_section! {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoundClose {
-    /// Nothing but time, as in the paper. Adds up to a period of latency.
+    /// Only the time, as in the paper. Adds up to a period of latency.
     Periodic,
-    /// Every live vehicle has reported since the last round, at the latest the period, or a tenth more while reports
-    /// come in. The default.
+    /// Every live vehicle has reported since the last round, at the latest the period, or a tenth
+    /// more while reports come in. The default.
     WhenComplete,
 }
 
@@ -60,7 +63,8 @@ pub struct RoundTrigger {
     live: [BTreeMap<NodeName, Reporter>; ReportKind::COUNT],
     /// Number of live vehicles that have not reported in the present round.
     missing: usize,
-    /// Number of vehicles whose report was due when the last round closed and that have not reported since.
+    /// Number of vehicles whose report was due when the last round closed and that have not
+    /// reported since.
     due: usize,
     /// Length of the present round.
     length: Duration,
@@ -111,8 +115,8 @@ impl Reporter {
     }
 }
 
-/// The due time of the first round of a leadership. After [`Self::Overdue`] and [`Self::AfterConnects`] a few more follow
-/// quickly.
+/// The due time of the first round of a leadership. After [`Self::Overdue`] and
+/// [`Self::AfterConnects`] a few more follow quickly.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum FirstRound {
@@ -122,28 +126,32 @@ pub enum FirstRound {
     OnTime,
     /// At once: the other nodes are connected to this node's broker and wait.
     Overdue,
-    /// [`CONNECT_TIME`] from now: the other nodes wait, but are not connected to this node's broker yet.
+    /// [`CONNECT_TIME`] from now: the other nodes wait, but are not connected to this node's broker
+    /// yet.
     AfterConnects,
 }
 
-/// Time for a vehicle to connect to a new broker, with a margin. The vehicle misses maps that are sent earlier.
+/// Time for a vehicle to connect to a new broker, with a margin. The vehicle misses maps that are
+/// sent earlier.
 pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 
-/// Lengths of the rounds after the first of an unplanned leadership: a vehicle that connects late waits for one of these,
-/// not for a whole period.
+/// Lengths of the rounds after the first round of an unplanned leadership: a vehicle that connects
+/// late waits for one of these rounds, not for a whole period.
 const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 
 /// Number of shortened rounds after the first of an unplanned leadership.
 pub const EARLY_ROUNDS: usize = EARLY.len();
 
-/// Number of its intervals after which a silent vehicle is no longer live.
+/// Number of report intervals after which a silent vehicle stops counting as live.
 const LIVE_INTERVALS: u32 = 3;
 
-/// Time for which a silent vehicle is remembered. Reports that come less often do not hold up rounds.
+/// Time for which a silent vehicle is remembered. Reports that come less often do not hold up
+/// rounds.
 const REMEMBERED: Duration = Duration::from_secs(3);
 
-/// Maximum number of rounds in a period. Excepted are the first rounds of a leadership and those that follow at once with
-/// the reports of vehicles that were due; they are few, as a vehicle is not due again for half a period.
+/// Maximum number of rounds in a period. The first rounds of a leadership are exempt, and so are
+/// the rounds that immediately follow with the reports of vehicles that were due. They are few,
+/// because a vehicle is not due again for half a period.
 const MAX_RATE: u32 = 5;
 
 /// Inverse share of a period by which the end of a round is delayed after its first report.
@@ -168,14 +176,15 @@ impl RoundTrigger {
         }
     }
 
-    /// Goes on with another interval; the present round lasts no longer than either.
+    /// Applies another interval; the current round lasts no longer than the old and the new
+    /// interval.
     pub(super) fn configure(&mut self, config: RoundConfig) {
         self.length = self.length.min(config.period());
         self.config = config;
     }
 
-    /// Takes a report; true when it closes the round as the last missing one. [`Self::tick`] alone closes a round whose
-    /// period is over, so that it includes all reports that come at its end.
+    /// Takes a report; true when it closes the round as the last missing one. [`Self::tick`] alone
+    /// closes a round whose period is over, so that it includes all reports that come at its end.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];
@@ -212,7 +221,8 @@ impl RoundTrigger {
     /// Begins the next round, whether or not the present one is due.
     pub(super) fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
-        // After a round that was held, another node may take over, or vehicles are still connecting.
+        // After a round that was held, another node may take over, or vehicles are still
+        // connecting.
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {

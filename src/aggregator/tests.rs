@@ -266,7 +266,8 @@ fn settled_votes_become_evidence_that_another_aggregator_adopts() {
     );
 }
 
-/// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three seconds, by vehicle.
+/// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three
+/// seconds, by vehicle.
 fn settled(
     cell: &mut Aggregator,
     nodes: &[&str],
@@ -314,7 +315,8 @@ fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
         FirstRound::Overdue,
         at(950),
     );
-    // Neither vehicle reaches the standby again, and one of them the edge: each has voted for less than two seconds.
+    // Both vehicles lose the standby, and one of them also the edge: each has voted for less than
+    // two seconds.
     let at_the_edge = settled(&mut edge, &["euclid"], (1000, 1500));
     let at_the_standby = settled(&mut standby, &[], (1000, 1500));
     assert_eq!(
@@ -350,7 +352,7 @@ fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds(
     let mut last = Timeliness::default();
     for n in 0..100 {
         for kind in [Detections, VoteDetections] {
-            // A clock that nobody can follow.
+            // A clock that jumps too much to be estimated.
             let _rejected = cell.report(kind, &report("bad", "cup", n * 10_000), at(n * 100 + 2));
         }
         last = cell.timeliness(at(n * 100 + 2));
@@ -400,7 +402,8 @@ fn the_parts_of_a_vehicle_are_one_witness() {
     );
 }
 
-/// Frames of a slower camera are older than those of a faster one that came before, and it has sent fewer.
+/// Frames of a slower camera are older than frames of a faster camera that arrived earlier, and the
+/// slower camera has sent fewer.
 #[test]
 fn the_cameras_of_a_vehicle_may_overtake_one_another() {
     let mut cell = leader(FusionConfig::default());

@@ -1,4 +1,5 @@
-//! The descriptions that a node had, and who stated them: the way back when a certificate is revoked.
+//! The descriptions that a node had, and the nodes that stated them, for going back when a
+//! certificate is revoked.
 
 use std::sync::Arc;
 
@@ -12,8 +13,9 @@ pub struct AttributedDescription {
     /// The description.
     #[serde(flatten)]
     pub description: Arc<CellDescription>,
-    /// Certificates in base64 of the candidates that stated it when it was adopted. Empty for one that was set here, in a
-    /// cell without certificates, and where more than eight candidates stated it.
+    /// Certificates in base64 of the candidates that stated the description when it was adopted.
+    /// Empty for a description that was set here, in a cell without certificates, and if more than
+    /// eight candidates stated it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub authors: Vec<String>,
 }
@@ -22,8 +24,9 @@ pub struct AttributedDescription {
 pub(super) const MAX_AUTHORS: usize = 8;
 
 impl AttributedDescription {
-    /// True if it is of no other than revoked nodes. One that has it from many hears who passes it on, too: it goes back
-    /// when a node that had it from its author does.
+    /// True if only revoked nodes stated the description. A node that has it from many candidates
+    /// also receives the statements of nodes that passed it on; it goes back when a node that had
+    /// the description from its author goes back.
     pub fn is_of_revoked(&self, is_revoked: impl Fn(&str) -> bool) -> bool {
         !self.authors.is_empty()
             && self
@@ -33,7 +36,8 @@ impl AttributedDescription {
     }
 }
 
-/// The present description, and the latest earlier one of each node that it came from. This is what a node saves.
+/// The current description, and the latest earlier description from each node. This is the state
+/// that a node saves.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DescriptionHistory {
     /// The present one.
@@ -44,7 +48,8 @@ pub struct DescriptionHistory {
     pub earlier: Vec<AttributedDescription>,
 }
 
-/// Maximum number of earlier descriptions; the oldest gives way. One certificate displaces one at most.
+/// Maximum number of earlier descriptions; the oldest is dropped first. One certificate displaces
+/// at most one description.
 const MAX_EARLIER: usize = 4;
 
 impl DescriptionHistory {
@@ -72,8 +77,8 @@ impl DescriptionHistory {
         }
     }
 
-    /// Drops all descriptions of revoked certificates. True if the present one was one of them; the latest other one, if
-    /// there is any, takes its place.
+    /// Drops all descriptions of revoked certificates. Returns true if the current description was
+    /// among them; the latest remaining one, if any, then becomes current.
     pub(super) fn drop_revoked(&mut self, is_revoked: impl Fn(&str) -> bool) -> bool {
         let is_dropped = |held: &AttributedDescription| held.is_of_revoked(&is_revoked);
         self.earlier.retain(|held| !is_dropped(held));

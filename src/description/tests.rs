@@ -361,7 +361,7 @@ fn bodies_that_nobody_states_take_bounded_room() {
     assert!(adopts(&euclid.take(stated, at(2))), "the leader repeats it");
 }
 
-/// Word of a node with this certificate.
+/// Statement of a node with this certificate.
 fn certified(certificate: &str, stamp: DescriptionStamp) -> DescriptionStatement {
     DescriptionStatement {
         certificate: Some(certificate.into()),
@@ -506,7 +506,8 @@ fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
     assert_eq!(edge.current().unwrap().text, "right");
 }
 
-/// A node that comes late hears all candidates state the description: it goes with none of them alone.
+/// A node that starts late receives statements of all candidates, so a single revoked candidate
+/// does not make it go back.
 #[test]
 fn a_description_stays_when_one_of_those_that_pass_it_on_is_revoked() {
     let right = described(6, "right");

@@ -15,13 +15,13 @@ pub struct BrokerAddress {
     port: u16,
 }
 
-/// A broker address that is not `host:port`.
+/// Error for a broker address that is not of the form `host:port`.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("broker address {0:?} must be host:port, such as 192.168.1.10:1883")]
 pub struct InvalidAddress(String);
 
 impl BrokerAddress {
-    /// The host, an IPv6 address in brackets.
+    /// The host; an IPv6 address is in brackets.
     pub fn host(&self) -> &str {
         &self.host
     }

@@ -1,17 +1,22 @@
-//! The cell's time: one time scale for all stamps on the wire, whatever the nodes' wall clocks say.
+//! The cell's time: one time scale for all stamps on the wire, independent of errors in the nodes'
+//! wall clocks.
 //!
-//! A node's *steady clock* never steps; it times everything inside the node. Its *wall clock* may be wrong and may step.
-//! Nodes compare steady clocks by stamps in the election's messages ([`ClockStamps`], [`OffsetFilter`]). The leader keeps
-//! the cell's time as an offset from its steady clock, and followers take it over.
+//! A node's *steady clock* never steps; it times everything inside the node. Its *wall clock* may
+//! be wrong and may step. Nodes compare their steady clocks by the stamps in election messages
+//! ([`ClockStamps`], [`OffsetFilter`]). The leader keeps the cell's time as an offset from its
+//! steady clock, and followers copy that time.
 //!
-//! - The leader goes by the median of the candidates' wall clocks. Of two that differ, it keeps to the one nearer to the
-//!   cell's time so far. So one node alone moves it in cells of one candidate only.
-//! - A wall clock before [`EARLIEST`] was never set and does not count.
-//! - A new leader goes on from the old one's time. Small errors are slewed away; larger ones make it jump.
-//! - A follower's stamps never depend on its own wall clock, so a step of that costs nothing.
+//! - The leader follows the median of the candidates' wall clocks. If there are two middle values
+//!   that differ, it uses the value nearer to the current cell time. One node's clock can therefore
+//!   move the cell's time only in cells with a single candidate.
+//! - A wall clock before [`EARLIEST`] counts as unset and is ignored.
+//! - A new leader continues with the old leader's time. Small errors are slewed away; larger errors
+//!   make the cell's time jump.
+//! - A follower's stamps don't depend on its own wall clock, so a step of that clock does no harm.
 //!
-//! Call [`CellTime::stamps`] for every message sent, [`CellTime::receive`] and then [`CellTime::follow`] for every one
-//! received, and [`CellTime::look`] from time to time. [`CellTime::reading`] has the outcome.
+//! Call [`CellTime::stamps`] for every message sent, [`CellTime::receive`] and then
+//! [`CellTime::follow`] for every message received, and [`CellTime::look`] periodically.
+//! [`CellTime::reading`] returns the result.
 
 mod offset_filter;
 
@@ -29,46 +34,47 @@ use crate::model::time::Timestamp;
 use crate::wire::Role;
 use offset_filter::{Exchange, Offset};
 
-/// A wall clock before this time, the beginning of 2025, was never set.
+/// Wall clocks before this time, the beginning of 2025, count as unset.
 pub const EARLIEST: Timestamp = Timestamp(1_735_689_600_000_000);
 
-/// The cell's time as one node knows it.
+/// One node's estimate of the cell's time.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ClockReading {
-    /// The cell's time less the node's steady clock in microseconds.
+    /// The cell's time minus the node's steady clock, in microseconds.
     pub offset_us: i64,
-    /// Largest error of the offset in microseconds; none while the node goes by its own wall clock.
+    /// Maximum error of the offset in microseconds; `None` while the node uses its own wall clock.
     pub error_us: Option<u32>,
 }
 
-/// Event worth a line in the log.
+/// Clock event for the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ClockEvent {
-    /// The node's wall clock stepped by so many microseconds.
+    /// The node's wall clock stepped by this many microseconds.
     WallStepped(i64),
-    /// The leader let the cell's time jump by so many microseconds.
+    /// The leader made the cell's time jump by this many microseconds.
     CellJumped(i64),
 }
 
-/// A clock that is off.
+/// A clock with a large error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WrongClock<'a> {
-    /// The other node that has it; none for the node itself.
+    /// The other node that has this clock; `None` for this node's own clock.
     pub node: Option<&'a NodeName>,
-    /// Its error in microseconds, positive if it is ahead.
+    /// Error of the clock in microseconds, positive if the clock is ahead.
     pub error_us: i64,
-    /// True if the cell's time follows it, or another wrong one: the error is against the other clocks then.
+    /// True if the cell's time follows this clock or another wrong clock; the error is then
+    /// measured against the other clocks.
     pub is_cell_wrong: bool,
     /// False if another clock may be the wrong one instead.
     pub is_certain: bool,
 }
 
-/// One node's knowledge of all clocks.
+/// One node's state of all clocks in the cell.
 #[derive(Debug, Clone)]
 pub struct CellTime {
     /// True if the node's own wall clock counts.
     is_candidate: bool,
-    /// The node's wall clock less its steady clock; none before the first look.
+    /// The node's wall clock minus its steady clock; `None` before the first call of `look`.
     wall_offset_us: Option<i64>,
     peers: BTreeMap<NodeName, PeerClock>,
     reading: Option<ClockReading>,
@@ -79,20 +85,20 @@ pub struct CellTime {
 #[derive(Debug, Clone)]
 struct PeerClock {
     run: u64,
-    /// False for a node of an earlier version.
+    /// False for a node of an earlier version, which sends no stamps.
     has_stamps: bool,
     last: AnsweredStamps,
     filter: OffsetFilter,
-    /// Its wall clock less its steady clock, if its clock was set.
+    /// The node's wall clock minus its steady clock, if its wall clock was set.
     wall_offset_us: Option<i64>,
-    /// True if it may lead: its wall clock counts for the cell's time.
+    /// True if the node may lead: its wall clock counts for the cell's time.
     is_candidate: bool,
-    /// The cell's time less its steady clock, as it knows it.
+    /// The cell's time minus the node's steady clock, as estimated by that node.
     cell_offset_us: Option<i64>,
 }
 
 impl PeerClock {
-    /// Its wall clock less this node's steady clock.
+    /// The peer's wall clock minus this node's steady clock.
     fn wall_offset_us(&self, now: Timestamp) -> Option<i64> {
         Some(
             self.wall_offset_us?
@@ -102,7 +108,8 @@ impl PeerClock {
 }
 
 impl CellTime {
-    /// A state that knows of no clock. The node's own wall clock counts only if its role may lead.
+    /// Initial state without any clock offsets. The node's own wall clock counts only if its role
+    /// may lead.
     pub fn new(role: Role) -> Self {
         Self {
             is_candidate: role != Role::Cav,
@@ -113,7 +120,7 @@ impl CellTime {
         }
     }
 
-    /// The cell's time, or the node's own wall clock while that is not known.
+    /// The cell's time, or the node's own wall clock until a cell time is available.
     pub fn reading(&self) -> ClockReading {
         let own = ClockReading {
             offset_us: self.wall_offset_us.unwrap_or_default(),
@@ -122,8 +129,8 @@ impl CellTime {
         self.reading.unwrap_or(own)
     }
 
-    /// Clocks that are off by [`MIN_CLOCK_JUMP`] or more, by the time that most clocks have; the node's own is without a
-    /// name. Where no two agree on a time, each may be the wrong one.
+    /// Clocks that differ by [`MIN_CLOCK_JUMP`] or more from the time on which most clocks agree.
+    /// The node's own clock has no name. If no two clocks agree, any of them may be the wrong one.
     pub fn wrong_clocks(&self, now: Timestamp) -> Vec<WrongClock<'_>> {
         let errors = self.wall_errors(now);
         let agree = |time: i64| {
@@ -132,7 +139,7 @@ impl CellTime {
                 .filter(|(_, us)| us.saturating_sub(time).abs() < micros(MIN_CLOCK_JUMP))
                 .count()
         };
-        // The cell's time, if as many clocks have it as any other.
+        // The cell's time, unless more clocks agree on another time.
         let times = [0].into_iter().chain(errors.iter().map(|(_, us)| *us));
         let time = times
             .rev()
@@ -154,8 +161,9 @@ impl CellTime {
             .collect()
     }
 
-    /// Errors of all wall clocks that are known in microseconds, positive if ahead of the cell's time: of the node's own,
-    /// without a name, and of others. None while the node does not know the cell's time.
+    /// Errors of all available wall clocks in microseconds, positive if ahead of the cell's time:
+    /// first the node's own (without a name), then those of the other nodes. Empty until the node
+    /// has a cell time.
     pub fn wall_errors(&self, now: Timestamp) -> Vec<(Option<&NodeName>, i64)> {
         let Some(cell) = self.reading.map(|reading| reading.offset_us) else {
             return Vec::new();
@@ -171,7 +179,7 @@ impl CellTime {
             .collect()
     }
 
-    /// Stamps for a message to a node, sent `now` by the steady clock.
+    /// Stamps for a message to a node, sent at `now` by the steady clock.
     pub fn stamps(&self, to: &NodeName, now: Timestamp) -> ClockStamps {
         let lately =
             |peer: &&PeerClock| peer.has_stamps && now.since(peer.last.received_us) < CLOCK_MEMORY;
@@ -184,8 +192,8 @@ impl CellTime {
         }
     }
 
-    /// Takes the stamps of a message that arrived `now`. The transport must prove the sender and its rights: only wall
-    /// clocks of possible leaders count.
+    /// Processes the stamps of a message that arrived at `now`. The transport must verify the
+    /// sender and its rights, because only the wall clocks of possible leaders count.
     pub fn receive(&mut self, message: &ElectionMessage, rights: Rights, now: Timestamp) {
         let stamps = message.clock.as_deref().copied().unwrap_or(ClockStamps {
             sent_us: now,
@@ -230,7 +238,8 @@ impl CellTime {
         }
     }
 
-    /// Takes over the time of the leader that this node follows, after each message and each change of leader.
+    /// Adopts the time of the leader that this node follows. Call it after each message and each
+    /// change of leader.
     pub fn follow(&mut self, leadership: &Leadership, now: Timestamp) {
         let leader = leadership.leader().filter(|_| !leadership.is_leading());
         let Some(leader) = leader.and_then(|leader| self.peers.get(leader)) else {
@@ -253,12 +262,14 @@ impl CellTime {
         }
     }
 
-    /// Forgets the clock of a node that is not trusted any more. If it led, its successor goes by the others' clocks.
+    /// Removes the clock of a node that is not trusted any more. If that node led, its successor
+    /// uses the other nodes' clocks.
     pub fn forget(&mut self, name: &NodeName) {
         self.peers.remove(name);
     }
 
-    /// Looks at the wall clock, `wall_offset_us` ahead of the steady one. A leader adjusts the cell's time.
+    /// Reads the wall clock, which is `wall_offset_us` ahead of the steady clock. A leader adjusts
+    /// the cell's time.
     pub fn look(
         &mut self,
         wall_offset_us: i64,
@@ -285,7 +296,7 @@ impl CellTime {
         events
     }
 
-    /// Moves the cell's time towards the candidates' clocks; returns its jump, if any.
+    /// Moves the cell's time towards the candidates' clocks and returns a jump if one was needed.
     fn lead(&mut self, elapsed: Duration, now: Timestamp) -> Option<ClockEvent> {
         let before = self.reading.map(|reading| reading.offset_us);
         let start = before.or(self.wall_offset_us)?;
@@ -328,7 +339,8 @@ impl CellTime {
     }
 }
 
-/// Step of a clock that is logged; less is noise of reading two clocks.
+/// Minimum step of a clock that is logged, in microseconds; smaller steps are noise from reading
+/// two clocks.
 const MIN_LOGGED_STEP_US: i64 = 5_000;
 
 fn micros(duration: Duration) -> i64 {

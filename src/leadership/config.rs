@@ -5,38 +5,43 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check_range};
 use crate::wire::Role;
 
-/// Settings of one node's part in the election; `[election]` in the configuration file.
+/// Settings of the election on one node; `[election]` in the configuration file.
 ///
-/// The timings must be the same on every node of a cell, role and priority are each node's own.
+/// The timings must be the same on every node of a cell. Role and priority are set per node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ElectionConfig {
-    /// Role for which the node is meant; the `role` of the node, no key of this table. Default `auto`.
+    /// Role of the node; taken from the node's `role`, not a key of this table. Default `auto`.
     #[serde(skip)]
     pub role: Role,
-    /// Preference among nodes of one role, higher leads first. Default 100.
+    /// Preference among nodes of one role; a higher value leads first. Default 100.
     pub priority: u8,
-    /// Time between two beats of the leader to its standby, in ms; its other successors, and better nodes that are not
-    /// fit, get every eighth. Default 50.
-    /// Shorter finds a silent leader sooner and costs packets.
+    /// Time between two beats of the leader to its standby, in ms. Other successors, and better
+    /// candidates that are not yet fit, get every eighth beat. Default 50. A shorter time detects a
+    /// silent leader sooner and costs packets.
     pub beat_ms: u64,
-    /// Time between two beats of the leader to everyone else, in ms. Default 2500. Shorter costs a large cell packets.
+    /// Time between two beats of the leader to all other nodes, in ms. Default 2500. A shorter time
+    /// costs packets in a large cell.
     pub idle_beat_ms: u64,
-    /// Beats that must be missing in a row, and no round taken, before a leader counts as lost. Default 4. Fewer is
-    /// faster, and takes lost packets for a lost leader more often.
+    /// Number of consecutive missing beats, without an accepted round, after which a leader counts
+    /// as lost. Default 4. A lower value detects a loss faster, but more often mistakes lost
+    /// packets for a lost leader.
     pub silence_beats: u32,
-    /// Time for which a node that starts listens before it may lead, in ms. Default 1200. Longer makes it surer to find the
-    /// leader that is there, and a lone vehicle wait.
+    /// Time for which a node listens after its start before it may lead, in ms. Default 1200. A
+    /// longer time makes it more likely to find the existing leader, and makes a lone vehicle wait.
     pub join_ms: u64,
-    /// Time that each next candidate waits longer before it claims the lead, in ms. Default 60. Must exceed the
-    /// network's usual delay. Otherwise two candidates claim at once, and one of them gives way.
+    /// Additional time that each next candidate waits before it claims leadership, in ms.
+    /// Default 60. It must exceed the network's usual delay. Otherwise two candidates claim at
+    /// once, and one of them has to step down.
     pub claim_step_ms: u64,
-    /// Time for which a better candidate must be fit and heard before it is handed the lead, in ms. Default 3000.
-    /// Longer suffers a node that comes and goes less, and stays with the substitute longer.
+    /// Time for which a better candidate must be fit and reachable before leadership is handed to
+    /// it, in ms. Default 3000. A longer time avoids handovers to an unstable node, and keeps the
+    /// substitute leader longer.
     pub stable_ms: u64,
     /// Time after which the leader gives up a handover, in ms. Default 3000.
     pub handover_ms: u64,
-    /// A timer later than this was stalled, in ms; only this much of the delay counts as time. Default 40.
+    /// Delay of a timer in ms above which the node counts as stalled; only this much of the delay
+    /// counts as elapsed time. Default 40.
     pub stall_ms: u64,
 }
 
@@ -61,7 +66,7 @@ impl ElectionConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first key that is out of range.
+    /// Returns a [`ConfigError`] that names the first key that is out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let ms = |key, value: u64, low: f64, high: f64| check_range(key, value as f64, low, high);
         ms("beat_ms", self.beat_ms, 5.0, 10_000.0)?;

@@ -1,24 +1,25 @@
-//! Detection of a broker that takes what is sent and passes nothing on.
+//! Detection of a stalled broker, which accepts messages and does not forward them.
 //!
-//! A broker that hangs, or whose answers are lost, keeps its connections. For seconds only the missing echo of this
-//! node's own messages shows it. Messages are counted beside the time: a node that was stopped itself sent nothing, and
-//! does not blame its broker.
+//! A broker that hangs, or whose answers are lost, keeps its connections open. For some seconds the
+//! only symptom is that this node's own messages are not echoed. The monitor counts messages in
+//! addition to time: a node that was stalled itself sent no messages, so it does not mistake its
+//! own stall for a stalled broker.
 
 use crate::leadership::timers::{ECHO_TIMEOUT, MIN_UNANSWERED};
 use crate::model::time::Timestamp;
 
-/// Number and age of the messages sent since anything came in on a link.
+/// Number and age of the messages sent since the last packet arrived on a link.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct EchoMonitor {
-    /// Packets that had come in when the first of them was sent.
+    /// Number of packets received when the first of these messages was sent.
     packets: u64,
     since: Timestamp,
     unanswered: u32,
 }
 
 impl EchoMonitor {
-    /// Notes a message that should come back, on a link where so many packets have come in; true when the broker is
-    /// stalled.
+    /// Records a message that the broker should echo, on a link that has received `packets` packets
+    /// so far. Returns true if the broker is stalled.
     pub fn note_sent(&mut self, packets: u64, now: Timestamp) -> bool {
         if self.unanswered == 0 || packets != self.packets {
             *self = Self {
@@ -36,7 +37,8 @@ impl EchoMonitor {
 mod tests {
     use super::*;
 
-    /// Time in ms at which the broker counts as stalled, for messages sent at these milliseconds without an answer.
+    /// Time in ms at which the broker counts as stalled, if messages are sent at the given times
+    /// and not answered.
     fn stalled_at(sent_ms: impl IntoIterator<Item = u64>) -> Option<u64> {
         let mut echo = EchoMonitor::default();
         sent_ms

@@ -2,47 +2,56 @@
 //!
 //! # Call order
 //!
-//! [`Election::new`] with the persisted term, then, for as long as the node runs: [`Election::handle`] with whatever
-//! happened, [`Election::tick`] at [`Election::next_deadline`]. Both return [`ElectionEffect`]s to be carried out in order.
-//! A caller that was held up handles all waiting messages before it ticks. Equal inputs give equal effects.
+//! Call [`Election::new`] with the persisted term. Then call [`Election::handle`] for every input
+//! and [`Election::tick`] at [`Election::next_deadline`]. Both return [`ElectionEffect`]s that the
+//! caller carries out in order. After a stall, the caller handles all waiting messages before it
+//! calls `tick`. Equal inputs give equal effects.
 //!
 //! # Kinds of methods
 //!
-//! - *Machine*: [`Election::new`], [`Election::handle`], [`Election::tick`], [`Election::next_deadline`].
-//! - *Questions*, which change nothing: [`Election::epoch`], [`Election::leader`], [`Election::is_leading`],
-//!   [`Election::standby`], [`Election::term`].
+//! - *Machine*: [`Election::new`], [`Election::handle`], [`Election::tick`],
+//!   [`Election::next_deadline`].
+//! - *Queries*, which don't change the state: [`Election::epoch`], [`Election::leader`],
+//!   [`Election::is_leading`], [`Election::standby`], [`Election::term`].
 //!
 //! # States
 //!
-//! *Seeking* (no leader known, `seeking.rs`), *following* (`following.rs`, `liveness.rs`), *leading* (`leading.rs`,
-//! `handover.rs`). See `docs/election.md` for messages, timings and sequences.
+//! *Seeking* (without a leader, `seeking.rs`), *following* (`following.rs`, `liveness.rs`),
+//! *leading* (`leading.rs`, `handover.rs`). See `docs/election.md` for messages, timings and
+//! sequences.
 //!
 //! # Invariants
 //!
-//! 1. No two leaderships share an [`Epoch`]: a node uses a term once, and the epoch holds its name. The term is handed to
-//!    the disk first; see [`ElectionEffect::Lead`] for a disk that fails.
-//! 2. The epoch that a node follows or leads never goes back while it runs, nor below the saved term after a restart.
-//!    One exception: a node without a term of its own drops a first term that the other candidates never reached.
-//! 3. A component whose links all work both ways, left alone, has exactly one leader: the best candidate by role and
-//!    priority, if one is fit.
-//! 4. Only a better candidate replaces a leader that is there, fit, and reached by its followers, by handover.
-//! 5. Time that a node was stalled is no silence of others.
+//! 1. Every leadership has its own [`Epoch`]: a node uses a term once, and the epoch contains the
+//!    node's name. The term is written to disk first; [`ElectionEffect::Lead`] describes what
+//!    happens if the disk fails.
+//! 2. The epoch that a node follows or leads never decreases while the node runs, and it does not
+//!    fall below the saved term after a restart. One exception: a node without a term of its own
+//!    drops a first term that the other candidates have not reached.
+//! 3. A group of nodes whose links all work in both directions settles on exactly one leader: the
+//!    best candidate by role and priority, if any candidate is fit.
+//! 4. A leader that is alive, fit and reachable for its followers is only replaced by a better
+//!    candidate, through a handover.
+//! 5. A node does not count its own stall time toward a peer's timeout.
 //! 6. A node whose broker, fuser or gateway is broken does not lead.
 //!
-//! There are no votes and no majority: every side of a split network serves its vehicles. When two leaders meet, rank
-//! (role, priority) and the number of followers decide which one stays. If that one has the lower epoch, it goes on in a
-//! term above both. Epochs tell apart what each of them published before.
+//! There are no votes and no majority: every side of a split network serves its vehicles. When two
+//! leaders receive each other's beats, their rank (role, priority) and number of followers decide
+//! which leader stays. If the remaining leader has the lower epoch, it continues in a term above
+//! both. Epochs distinguish the earlier rounds of the two leaders.
 //!
-//! # Why the leader beats by itself
+//! # Why the leader sends its own beats
 //!
-//! Measured with `kill -9` in a cell of five on one machine, until all others knew: a leader that beats every 40 ms and
-//! is given up after 160 ms takes 140 ms at the median and 164 ms at most; SWIM gossip (foca, 40 ms period) takes 155
-//! and 251 ms. A silent leader has to be replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room
-//! for a lost packet. Moreover the beat carries what a successor needs, its round and its successors, and proves that
-//! the *election* of the leader is alive, not just its process. Gossip stays the better way to *find* nodes, as its
-//! cost per node does not grow with the cell; what it finds enters as [`ElectionInput::PeerAlive`] and
-//! [`ElectionInput::PeerDown`]. To keep a leader's packets few, only its standby gets every beat, its other successors and
-//! better nodes that are not fit every eighth, and everyone else one each `idle_beat_ms`.
+//! Time until all other nodes detected a leader killed with `kill -9`, in a cell of five nodes on
+//! one machine: with a beat every 40 ms and a timeout of 160 ms, 140 ms (median) and 164 ms
+//! (maximum); with SWIM gossip (foca, 40 ms period), 155 and 251 ms. A silent leader has to be
+//! replaced within 400 ms, a period of 100 ms included, and 251 ms leaves no room for a lost
+//! packet. The beat also carries the data that a successor needs (the round number and the list of
+//! successors), and proves that the leader's *election* is alive, not just its process. Gossip is
+//! the better way to *find* nodes, because its cost per node does not grow with the cell; its
+//! results enter as [`ElectionInput::PeerAlive`] and [`ElectionInput::PeerDown`]. To limit a
+//! leader's packets, only its standby gets every beat. Other successors, and better candidates that
+//! are not yet fit, get every eighth beat, and all other nodes get one every `idle_beat_ms`.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -81,7 +90,7 @@ use liveness::Following;
 use peers::Peers;
 use seeking::{Questions, Seeking};
 
-/// Election as one node takes part in it.
+/// The election's state machine on one node.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Election {
     config: ElectionConfig,
@@ -92,9 +101,9 @@ pub struct Election {
     terms: Terms,
     /// The highest epoch followed or led.
     epoch: Option<Epoch>,
-    /// Highest epoch known to have ended.
+    /// Highest epoch that has ended, as far as this node has been informed.
     over: Option<Epoch>,
-    /// The last round known.
+    /// Number of the last round that was reported or published.
     round: u64,
     health: Health,
     load: u8,
@@ -104,7 +113,8 @@ pub struct Election {
     questions: Questions,
     /// Clock of the leader that was followed last.
     leader_clock: Option<LeaderClock>,
-    /// Questions about the leader that wait for its next sign of life: who asked, and the number of the question.
+    /// Questions about the leader that wait for the leader's next sign of life: the name of the
+    /// node that sent the question, and the number of the question.
     waiting_questions: Vec<(NodeName, u64)>,
     state: State,
     effects: Vec<ElectionEffect>,
@@ -117,29 +127,33 @@ enum State {
     Leading(Leading),
 }
 
-/// Terms that are known to have been used.
+/// Terms that nodes of the cell have used.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Terms {
-    /// Highest term that any node is known to have used.
+    /// Highest term that any node has stated or used.
     seen: u64,
-    /// Highest term that counts as this node's own: from its disk, led in, or known for `contact_timeout`.
+    /// Highest term that counts as this node's own: read from its disk, led in, or stated by peers
+    /// for `contact_timeout`.
     found: u64,
     /// Term handed to the disk.
     persisted: u64,
-    /// Highest known term at the beginning of the present [`TERM_WINDOW`], and when that was.
+    /// Value of `seen` at the beginning of the current [`TERM_WINDOW`], and the time when the
+    /// window began.
     window: (u64, Timestamp),
 }
 
 impl Terms {
-    /// True if this node has a term of its own. A first run that led alone leaves a 1 on disk, which does not count.
+    /// True if this node has a term of its own. A term of 1 on disk, from a first run in which the
+    /// node led alone, does not count.
     fn has_own(&self) -> bool {
         self.found > 1
     }
 }
 
 impl Election {
-    /// Election of a node that starts; it listens for `join_ms` before it leads. `persisted_term` is the last
-    /// [`ElectionEffect::PersistTerm`] of earlier runs, 0 without any.
+    /// Creates the election of a node that starts; it listens for `join_ms` before it leads.
+    /// `persisted_term` is the term of the last [`ElectionEffect::PersistTerm`] of earlier runs, or
+    /// 0.
     pub fn new(config: ElectionConfig, id: NodeName, persisted_term: u64, now: Timestamp) -> Self {
         let clock = AwakeClock::new(now, std::time::Duration::from_millis(config.stall_ms));
         let persisted = persisted_term.min(MAX_TERM);
@@ -171,7 +185,7 @@ impl Election {
         }
     }
 
-    /// Takes in what happened.
+    /// Processes one input and returns its effects.
     pub fn handle(&mut self, input: ElectionInput, now: Timestamp) -> Vec<ElectionEffect> {
         let now = self.advance(now);
         match input {
@@ -213,7 +227,7 @@ impl Election {
         self.epoch.as_ref()
     }
 
-    /// The leader as far as this node knows; `None` while it seeks.
+    /// The node's current leader; `None` while it seeks.
     pub fn leader(&self) -> Option<&NodeName> {
         self.current_epoch().map(|epoch| &epoch.leader)
     }
@@ -223,12 +237,12 @@ impl Election {
         matches!(self.state, State::Leading(_))
     }
 
-    /// True if this leader has said that the next round is its standby's.
+    /// True if this leader has yielded: its standby publishes the next round.
     pub fn is_yielding(&self) -> bool {
         matches!(&self.state, State::Leading(leading) if leading.is_yielding())
     }
 
-    /// The next leader, as named by the leader.
+    /// The next leader, as announced by the current leader.
     pub fn standby(&self) -> Option<&NodeName> {
         match &self.state {
             State::Seeking(_) => None,
@@ -237,7 +251,7 @@ impl Election {
         }
     }
 
-    /// The highest term that anyone is known to have used.
+    /// The highest term that any node has stated or used.
     pub fn term(&self) -> u64 {
         self.terms.seen
     }
@@ -267,7 +281,8 @@ impl Election {
     }
 
     fn finish(&mut self) -> Vec<ElectionEffect> {
-        // The disk gets the next term before it is needed: taking the lead need not wait for it.
+        // The next term is written to disk before it is needed, so that taking the lead does not
+        // have to wait for the disk.
         self.persist(self.terms.seen + 1);
         std::mem::take(&mut self.effects)
     }
@@ -279,6 +294,10 @@ impl Election {
         }
     }
 
+    /// Processes an authenticated message: checks its term and sequence number, records the
+    /// sender's state, and passes the body to the handler of its kind. Messages that are repeated,
+    /// overtaken or implausible are dropped before they change any state. For example, a `Beat`
+    /// reaches `take_beat` only if the sender itself leads the stated epoch.
     fn receive(&mut self, mut message: ElectionMessage, now: Timestamp) {
         if message.from == self.id {
             return;
@@ -342,8 +361,8 @@ impl Election {
         }
     }
 
-    /// Judges the term of a message, and puts a plausible one in its place where only the term is wrong: a node that was told
-    /// a wrong one is heard all the same.
+    /// Checks the term of a message. If only the term is implausible, replaces it by a plausible
+    /// term, so that a node that adopted a wrong term from elsewhere can still communicate.
     fn is_plausible(&mut self, message: &mut ElectionMessage, now: Timestamp) -> bool {
         if !self.terms.has_own()
             && message.candidacy.role != Role::Cav
@@ -365,8 +384,9 @@ impl Election {
         true
     }
 
-    /// Highest term that a node of this role may state now. A node without a term of its own believes the possible leader
-    /// that states the lowest term: one false claim does not separate it from the cell.
+    /// Highest term that a node of this role may state now. A node without a term of its own
+    /// accepts the lowest term stated by any possible leader, so that one false claim does not
+    /// separate it from the cell.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
         let heard_all = self.config.contact_timeout();
         let Terms {
@@ -398,7 +418,8 @@ impl Election {
         }
     }
 
-    /// Drops a first term that the other candidates never reached. Only a node without a term of its own does so.
+    /// Drops a first term that the other candidates have not reached. Only a node without a term of
+    /// its own does so.
     fn unlearn_first_term(&mut self, limit: u64, now: Timestamp) {
         if self.terms.has_own() || self.terms.seen <= limit {
             return;
@@ -417,11 +438,12 @@ impl Election {
         }
     }
 
+    /// Raises the highest used term to `term`.
     fn learn_term(&mut self, term: u64) {
         self.terms.seen = self.terms.seen.max(term);
     }
 
-    /// Notes the last round of a leadership as a node states it.
+    /// Records the last round of a leadership as stated by a node.
     fn learn_round(&mut self, from: &NodeName, round: u64) {
         let limit = if self.round == 0 {
             MAX_ROUND
@@ -436,7 +458,8 @@ impl Election {
         }
     }
 
-    /// Number of the first round of a leadership. Rounds begin anew long before receivers take no more.
+    /// Number of the first round of a new leadership. Rounds start over well before the largest
+    /// number that receivers accept.
     fn next_round(&self) -> u64 {
         if self.round < MAX_ROUND / 2 {
             self.round + 1
@@ -476,7 +499,7 @@ impl Election {
         }
     }
 
-    /// Tells others at once that this node neither leads nor could lead any more.
+    /// Informs the other nodes immediately that this node is neither leader nor candidate any more.
     fn leave(&mut self, now: Timestamp) {
         let Health { load_percent, .. } = self.health;
         self.set_health(
@@ -497,7 +520,7 @@ impl Election {
         }
     }
 
-    /// The epoch followed or led now.
+    /// The epoch that this node currently follows or leads.
     fn current_epoch(&self) -> Option<&Epoch> {
         match &self.state {
             State::Seeking(_) => None,
@@ -568,7 +591,7 @@ impl Election {
     }
 }
 
-/// A beat as received.
+/// Content of a received beat.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Beat {
     epoch: Epoch,

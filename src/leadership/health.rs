@@ -1,7 +1,8 @@
-//! Health of a node's own parts: whether they are fit to lead.
+//! Health of a node's own parts, which decides whether the node is fit to lead.
 //!
-//! The parts are looked at every [`HEALTH_PERIOD`]. A look shows at once whether the fuser's rounds fall due and how busy
-//! the machine is; broker and gateway answer later. A stop of the whole node is no fault of its parts.
+//! The parts are checked every [`HEALTH_PERIOD`]. Each check reads at once how often the fuser's
+//! rounds fell due and how busy the machine is; broker and gateway answer later. A stall of the
+//! whole node does not count as a fault of its parts.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -14,14 +15,14 @@ use crate::leadership::timers::{HEALTH_PERIOD, LOOK_TOLERANCE};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// The latest news of the parts.
+/// The latest state of the parts.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct HealthMonitor {
     links: BTreeMap<BrokerAddress, LinkState>,
-    /// Nodes whose certificates brokers have shown.
+    /// Nodes whose certificates the brokers have presented.
     nodes: BTreeMap<BrokerAddress, NodeName>,
     sample: HealthSample,
-    /// Time that passed while this node was awake.
+    /// Clock of the time during which this node was awake.
     clock: AwakeClock,
     look_at: Timestamp,
     rounds_due: u64,
@@ -29,23 +30,24 @@ pub struct HealthMonitor {
     load_percent: u8,
 }
 
-/// The answer of the parts to a look at them.
+/// The parts' answer to a check.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct HealthSample {
     /// True if clients can connect to the node's own broker.
     pub broker_serves: bool,
-    /// State of the gateway's links; none when it does not answer.
+    /// State of the gateway's links; `None` if the gateway does not answer.
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
     /// True if the fuser runs.
     pub fuser_runs: bool,
-    /// True if the fuser rejects nearly all vehicles' reports for their time.
+    /// True if the fuser rejects nearly all vehicles' reports because of their timestamps.
     pub rejects_reports: bool,
-    /// True if the node does not use the cell's description, as its own configuration contradicts it.
+    /// True if the node does not use the cell's description because its own configuration
+    /// contradicts it.
     pub contradicts: bool,
 }
 
 impl HealthMonitor {
-    /// A monitor that knows nothing; the first look is due at once.
+    /// Creates a monitor without any results; the first check is due at once.
     pub fn new(now: Timestamp) -> Self {
         Self {
             links: BTreeMap::new(),
@@ -59,14 +61,14 @@ impl HealthMonitor {
         }
     }
 
-    /// Time of the next look at the parts.
+    /// Time of the next check of the parts.
     pub fn next_deadline(&self) -> Timestamp {
         self.look_at
     }
 
-    /// True if to look at the parts now; the next look is then due [`HEALTH_PERIOD`] later.
+    /// True if the parts must be checked now; the next check is then due [`HEALTH_PERIOD`] later.
     pub fn is_due(&mut self, now: Timestamp) -> bool {
-        // A clock that was set back does not put the look off.
+        // A clock that was set back does not postpone the check.
         self.look_at = self.look_at.min(now + HEALTH_PERIOD);
         let is_due = now >= self.look_at;
         if is_due {
@@ -75,10 +77,11 @@ impl HealthMonitor {
         is_due
     }
 
-    /// Notes the state of a link; true when an established one has broken and nothing listens there any more.
+    /// Records the state of a link. Returns true if an established link has broken and its broker's
+    /// port is closed.
     pub fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
         match state {
-            // It is not known yet that nothing listens there.
+            // A closed port has not been confirmed yet.
             LinkState::Down | LinkState::Stalled => {
                 self.links
                     .entry(broker.clone())
@@ -93,30 +96,32 @@ impl HealthMonitor {
         }
     }
 
-    /// Notes whose certificate a broker has shown.
+    /// Records which node's certificate a broker presented.
     pub fn note_node(&mut self, broker: BrokerAddress, node: NodeName) {
         self.nodes.insert(broker, node);
     }
 
-    /// Forgets all links: the gateway makes them anew.
+    /// Removes all links, because a restarted gateway connects anew.
     pub fn forget_links(&mut self) {
         self.forget_links_but(&[]);
     }
 
-    /// Forgets the links to all other brokers: the gateway ends them, and may make them anew later.
+    /// Removes the links to all brokers except `wanted`: the gateway closes them and may reopen
+    /// them later.
     pub fn forget_links_but(&mut self, wanted: &[BrokerAddress]) {
         self.links.retain(|broker, _| wanted.contains(broker));
         self.nodes.retain(|broker, _| wanted.contains(broker));
     }
 
-    /// Notes the answers. They make up for a link that came up before there was anyone to be told.
+    /// Records the parts' answers. They also contain links that came up before the monitor received
+    /// events.
     pub fn note_sample(&mut self, sample: HealthSample) {
         for (broker, state) in sample.links.iter().flatten() {
             match state {
                 LinkState::Up | LinkState::Stalled => {
                     self.links.insert(broker.clone(), *state);
                 }
-                // That it is refused is news of its own, which may still be under way.
+                // A refused link is reported separately, and the report may still be in transit.
                 LinkState::Down | LinkState::Refused => {
                     self.links
                         .entry(broker.clone())
@@ -127,7 +132,7 @@ impl HealthMonitor {
         self.sample = sample;
     }
 
-    /// Notes a look: the number of times so far that a round was due, and the processor load in percent.
+    /// Records a check: how often a round has been due so far, and the processor load in percent.
     pub fn note_look(&mut self, rounds_due: u64, load_percent: u8, now: Timestamp) {
         let due = self.clock.now() + HEALTH_PERIOD;
         let now = self.clock.advance(now, due);
@@ -138,9 +143,11 @@ impl HealthMonitor {
         self.load_percent = load_percent;
     }
 
-    /// Health of the parts, for the election. A node that uses an external broker, its own, or both, needs one of them.
-    /// A stalled link does not count as a link, rejected reports do not count as usable, nor settings of its own that
-    /// contradict the cell's. All of this is overlooked in a leader with `no_other` to lead: it would make way for nobody.
+    /// Health of the parts, for the election. A node needs the external broker or its own broker,
+    /// depending on which of them it uses; if it uses both, one is enough. A stalled link does not
+    /// count as a link, rejected reports do not count as usable, and own settings that contradict
+    /// the cell's do not count as valid. A leader with `no_other` candidate ignores all of this,
+    /// because stepping down would leave the cell without a leader.
     pub fn health(
         &self,
         plane: &DataPlane,
@@ -165,8 +172,8 @@ impl HealthMonitor {
         }
     }
 
-    /// True if members on other machines are reached: by the node's own broker, unless it is `private` to this machine,
-    /// or by an external one for as long as there is a link to it.
+    /// True if members on other machines can reach this node: by its own broker, unless it is
+    /// `private` to this machine, or by an external broker while there is a link to it.
     pub fn reaches_others(&self, plane: &DataPlane, private: bool, no_other: bool) -> bool {
         !private || self.is_up(plane.external.as_ref(), no_other)
     }
@@ -179,7 +186,8 @@ impl HealthMonitor {
         )
     }
 
-    /// True if this node is logged in at a node's broker, which has shown no other node's certificate.
+    /// True if this node is logged in at a node's broker and that broker has not presented another
+    /// node's certificate.
     pub fn is_logged_in_at(&self, node: &NodeName, broker: &BrokerAddress) -> bool {
         self.is_logged_in(broker) && self.nodes.get(broker).is_none_or(|shown| shown == node)
     }
@@ -213,7 +221,7 @@ mod tests {
         }
     }
 
-    /// A monitor of parts that answered, and have closed a round.
+    /// Creates a monitor of parts that have answered and have closed a round.
     fn monitor(now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::new(now);
         monitor.note_sample(sample(Some(BTreeMap::new())));

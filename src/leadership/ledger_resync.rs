@@ -1,28 +1,34 @@
 //! Replication of the evidence about vehicles between the candidates of a cell.
 //!
-//! - The leader records in the lane of the epoch in which it began, also in terms that it renews. What changed it shares
-//!   after the round, and everything in every snapshot period. Receivers keep the larger count, so that shares may come
-//!   late, twice, or in any order.
-//! - A node that has led sends a leader all it knows when it first hears it. Every other candidate listens for longer than
-//!   leaders take to share all they know, and then sends what nobody has shared, each at a time of its own. So evidence of
-//!   leaders that are gone is kept, too, when a split heals.
-//! - Evidence is accepted from candidates, of terms that the election knows, and by plausible steps. The leader's
-//!   present lane is accepted from the leader alone.
+//! - The leader records evidence in the lane of the epoch in which its leadership began, even after
+//!   it has renewed its term. It shares changes after each round, and all evidence once per
+//!   snapshot period. Receivers keep the larger count, so shares may arrive late, twice, or in any
+//!   order.
+//! - A node that has led sends all its evidence to a new leader when it first receives that leader.
+//!   Every other candidate waits for longer than leaders take to share all their evidence, and then
+//!   sends the evidence that no other candidate has shared. Each candidate sends at its own time.
+//!   In this way the evidence of former leaders survives, also when a split heals.
+//! - Evidence is accepted from candidates, for terms that the election has seen, and only in
+//!   plausible steps. The current leader's lane is accepted from the leader alone.
 //!
 //! # Signed evidence
 //!
-//! In a cell with certificates every share is of one lane and signed by the lane's aggregator. Other nodes pass on the
-//! same bytes. A signature proves who counted, not that it led. So a lane must come from the leader that
-//! this node follows, or followed a moment ago, or from another candidate than the lane's aggregator. Candidates
-//! accept nothing else themselves, so a lane that a candidate has invented for itself gets no further.
+//! In a cell with certificates every share contains one lane and is signed by the lane's
+//! aggregator. Other nodes pass on the same bytes. A signature proves which node counted, but not
+//! that this node led. Therefore a lane must come from the leader that this node follows or
+//! followed until recently, or from a candidate other than the lane's aggregator. Candidates apply
+//! the same rule to the evidence that they accept, so a lane that a candidate has invented for
+//! itself does not spread.
 //!
-//! A node that starts may hear a false claimant first, and follows it until the leader renews its term. So what an
-//! aggregator says of itself is on trial until its leadership was followed for [`EVIDENCE_TRIAL`]. Until then it counts
-//! here alone, as this node may be handed the lead. It is forgotten when another leader is followed, which tells of its
-//! predecessors what it knows. What an honest leader of a short time counted it tells again when it leads again.
+//! A node that starts may first receive a false claimant, and follows it until the true leader
+//! renews its term. For this reason an aggregator's own evidence is on probation until its
+//! leadership has been followed for [`EVIDENCE_TRIAL`]. Until then it counts on this node only,
+//! because leadership may be handed to this node. It is dropped when the node follows another
+//! leader, which shares the evidence of its predecessors. If an honest leader led only for a short
+//! time, it shares its counts when it leads again.
 //!
-//! Nothing is sent here: methods return the shares to publish. The caller signs those of the node's own lanes. Time is
-//! counted in ticks of the publication period.
+//! This module does not send messages: its methods return the shares to publish. The caller signs
+//! the shares of the node's own lanes. Time is counted in ticks of the publication period.
 
 mod growth;
 
@@ -43,10 +49,10 @@ use crate::wire::{
 use growth::GrowthLimit;
 pub use growth::is_plausible;
 
-/// Number of times that a leader is sent what it was not told, in case it was lost.
+/// Number of times that missing evidence is sent to a leader, in case messages are lost.
 const REPEATS: u32 = 3;
 
-/// One node's part in the replication of evidence.
+/// State of the replication on one node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LedgerResync {
     name: NodeName,
@@ -60,14 +66,14 @@ pub struct LedgerResync {
     has_led: bool,
     /// Ticks since the last snapshot.
     ticks: u32,
-    /// The leader that was heard last.
+    /// The leader whose messages were received last.
     leader: Option<Epoch>,
-    /// True if it is to have everything.
+    /// True if this node must send all its evidence to that leader.
     owes_everything: bool,
     everything_sent_at: Option<Timestamp>,
-    /// Evidence shared since it was first heard.
+    /// Evidence shared by any candidate since that leader was first received.
     shared: ReputationLedger,
-    /// Ticks until what was not shared is sent to it.
+    /// Ticks until this node sends the evidence that has not been shared.
     wait: u32,
     /// Number of times that this will still happen.
     repeats: u32,
@@ -76,7 +82,7 @@ pub struct LedgerResync {
     growth: GrowthLimit,
 }
 
-/// A leader that is followed or was a moment ago.
+/// The current leader, or a leader that was followed until recently.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Followed {
     /// Since when, without another leader.
@@ -87,7 +93,7 @@ struct Followed {
 /// Outcome of a share that was merged, or of a period that passed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Merged {
-    /// True if the ledger changed, or what of it is to be saved.
+    /// True if the ledger, or its part to be saved, has changed.
     pub is_news: bool,
     /// Reasons why entries were left out.
     pub refused: Vec<RejectReason>,
@@ -96,7 +102,8 @@ pub struct Merged {
 }
 
 impl LedgerResync {
-    /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify signatures first.
+    /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify
+    /// signatures first.
     pub fn signed(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self {
             is_signed: true,
@@ -104,7 +111,8 @@ impl LedgerResync {
         }
     }
 
-    /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of [`Self::tick`].
+    /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of
+    /// [`Self::tick`].
     pub fn new(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self {
             name,
@@ -125,7 +133,8 @@ impl LedgerResync {
         }
     }
 
-    /// Takes over what earlier runs knew: counts go on from there, and leap no further than before.
+    /// Restores the ledger of earlier runs: counts continue from there, with the same growth
+    /// limits.
     pub fn resume(&mut self, ledger: &ReputationLedger, now: Timestamp) {
         self.growth = GrowthLimit::of(ledger, now);
     }
@@ -147,8 +156,8 @@ impl LedgerResync {
         (self.leads, self.lane) = (None, None);
     }
 
-    /// The lane in which this node counts when it leads in `epoch`: that of its first epoch, unless evidence of another
-    /// leadership is later. The latest votes count most.
+    /// The lane in which this node counts when it leads in `epoch`: the lane of its first epoch,
+    /// unless there is evidence of a later leadership. The latest votes count most.
     pub fn lane_in(&mut self, epoch: &Epoch, ledger: &ReputationLedger) -> Epoch {
         self.lead(epoch.clone());
         let lane = self.lane.get_or_insert_with(|| epoch.clone());
@@ -158,7 +167,7 @@ impl LedgerResync {
         lane.clone()
     }
 
-    /// Records what a round of the node's own leadership says about vehicles.
+    /// Records the evidence about vehicles from a round of the node's own leadership.
     pub fn record(
         &mut self,
         epoch: &Epoch,
@@ -183,8 +192,9 @@ impl LedgerResync {
         self.shares(ledger, &changed, &reached)
     }
 
-    /// True if a broker vouches for the senders of shares: its own node's, this node's, and that of a leader that is
-    /// followed or was a moment ago. `broker` is the node whose certificate it has proven, if any.
+    /// True if a broker vouches for the senders of shares. It vouches for its own node, for this
+    /// node, and for a leader that is followed or was followed until recently. `broker` is the node
+    /// whose certificate the broker has proven, if any.
     pub fn is_vouched_for(
         &self,
         broker: Option<&NodeName>,
@@ -199,11 +209,13 @@ impl LedgerResync {
         })
     }
 
-    /// Checks the way on which a share came. A broker can let anybody publish in any name. So evidence that its sender has
-    /// not signed itself is taken only over a broker that vouches for the sender.
+    /// Checks the path on which a share arrived. A broker may let any client publish under any
+    /// name, so evidence that its sender has not signed itself is accepted only over a broker that
+    /// vouches for the sender.
     ///
     /// # Errors
-    /// The share is not to be used. [`RejectReason::Unattested`] if it has news, `None` if all of it is known.
+    /// Returns an error if the share must not be used: [`RejectReason::Unattested`] if it contains
+    /// new evidence, `None` if all of its evidence is already in the ledger.
     pub fn check_way(
         &self,
         broker: Option<&NodeName>,
@@ -221,12 +233,13 @@ impl LedgerResync {
         Err(is_news.then_some(RejectReason::Unattested))
     }
 
-    /// Takes in another candidate's share. `candidates` are the other nodes that may lead, `date` is `now` in the cell's
-    /// time.
+    /// Merges another candidate's share. `candidates` are the other nodes that may lead, `date` is
+    /// `now` in the cell's time.
     ///
     /// # Errors
-    /// [`RejectReason::NotCandidate`] for the share of a node that may not lead, [`RejectReason::BadSignature`] for one
-    /// without a signature where there must be one. Nothing is changed then.
+    /// Returns [`RejectReason::NotCandidate`] for a share of a node that may not lead, and
+    /// [`RejectReason::BadSignature`] for a share that lacks a required signature. The state is
+    /// unchanged in both cases.
     pub fn merge(
         &mut self,
         share: &LedgerShare,
@@ -251,13 +264,14 @@ impl LedgerResync {
         } else {
             self.judge(share, ledger, leadership, now)
         };
-        // A signed share is taken whole or not at all: it is passed on as it is.
+        // A signed share is accepted as a whole or not at all, because it is passed on unchanged.
         let is_whole =
             taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
         if is_over || (self.is_signed && !is_whole) {
             (taken.entries, taken.marks) = (Vec::new(), Vec::new());
         }
-        // A candidate may say that it leads while the election names another. The leader itself says it again.
+        // A candidate may claim to lead while the election names another leader. The true leader
+        // repeats its evidence.
         let is_leader = leadership
             .leader()
             .is_none_or(|leader| *leader == share.node);
@@ -269,7 +283,7 @@ impl LedgerResync {
             ledger,
             candidates,
         );
-        // The sender has not heard of the reset.
+        // The sender has not received the reset yet.
         self.owes_everything |= is_over;
         if self.repeats > 0 {
             self.shared.merge_share(&taken, self.leader.as_ref());
@@ -312,7 +326,7 @@ impl LedgerResync {
         let mut refused = BTreeSet::new();
         let mut is_usable = |lane: Epoch, is_plausible: bool, is_news: &dyn Fn() -> bool| {
             if self.lane.as_ref() == Some(&lane) {
-                // Only this node knows what it counts now.
+                // Only this node has its current counts.
                 return false;
             }
             let reason = if !leadership.knows_term(lane.term) {
@@ -324,7 +338,7 @@ impl LedgerResync {
             } else {
                 return true;
             };
-            // Candidates may repeat what all know.
+            // Candidates may repeat evidence that all nodes have.
             if is_news() {
                 refused.insert(reason);
             }
@@ -347,7 +361,7 @@ impl LedgerResync {
         (taken, refused.into_iter().collect())
     }
 
-    /// True if this node counted all that is known of a lane, and so signs it.
+    /// True if this node counted all evidence of a lane, and therefore signs it.
     fn has_counted(&self, lane: &Epoch, ledger: &ReputationLedger) -> bool {
         lane.leader == self.name && ledger.has_lane(lane) && !ledger.is_stated(lane)
     }
@@ -365,7 +379,7 @@ impl LedgerResync {
             .or(self.leader.as_ref().filter(is_of_leader))
     }
 
-    /// True if a candidate may tell of a lane.
+    /// True if a candidate may share the evidence of a lane.
     fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
         let is_counting =
             |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
@@ -375,7 +389,8 @@ impl LedgerResync {
         !self.is_signed || *sender != lane.leader || self.followed.contains_key(sender)
     }
 
-    /// Notes who leads; true if a trial of evidence ended. The last word of a leader may come when another leads already.
+    /// Records the current leader; returns true if evidence left probation. The last share of an
+    /// old leader may arrive when another node already leads.
     fn note_leader(
         &mut self,
         ledger: &mut ReputationLedger,
@@ -404,13 +419,13 @@ impl LedgerResync {
             .iter()
             .any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane))
         {
-            // A leader that ended and leads again may have lost what it had counted.
+            // A leader that stopped and leads again may have lost its counts.
             (self.wait, self.repeats) = (self.wait.max(1), REPEATS);
         }
         !judged.is_empty()
     }
 
-    /// End of the trial of what a leader tells of itself, unless it is over.
+    /// End of the probation of a leader's own evidence, or `None` if it has ended.
     fn trial_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
         self.followed
             .get(leader)
@@ -418,7 +433,8 @@ impl LedgerResync {
             .filter(|ends_at| *ends_at > now)
     }
 
-    /// Forgets all evidence if the share knows of a later reset than this node; true if it does.
+    /// Drops all evidence if the share contains a later reset than this node's; returns true in
+    /// that case.
     fn take_reset(
         &mut self,
         share: &LedgerShare,
@@ -464,8 +480,8 @@ impl LedgerResync {
         }
     }
 
-    /// All evidence, or one share that says that there is none: a node that takes over waits for it, and a node that has
-    /// some answers it.
+    /// All evidence, or a single empty share if there is none: a node that takes over waits for it,
+    /// and a node that has evidence answers it.
     pub fn snapshot(&self, ledger: &ReputationLedger) -> Vec<LedgerShare> {
         let mut shares = self.everything(ledger, None);
         if shares.iter().all(|share| share.entries.is_empty()) {
@@ -474,7 +490,8 @@ impl LedgerResync {
         shares
     }
 
-    /// Notes the leader whose share came; one that is heard for the first time may be told something.
+    /// Records the leader whose share arrived; if the leader is new, schedules evidence to be sent
+    /// to it.
     fn hear(&mut self, leader: Option<Epoch>, ledger: &ReputationLedger, candidates: &[NodeName]) {
         if leader.is_none() || leader == self.leader {
             return;
@@ -485,15 +502,16 @@ impl LedgerResync {
             self.has_led || ledger.entries().any(|entry| entry.aggregator == self.name);
     }
 
-    /// Ticks for which a new leader is listened to before it is told what it has not shared. It shares everything in two
-    /// thirds of that. Candidates speak in the order of their names.
+    /// Number of ticks for which this node waits before it sends missing evidence to a new leader.
+    /// The leader shares everything in two thirds of that time. Candidates send in the order of
+    /// their names.
     fn ticks_to_listen(&self, candidates: &[NodeName]) -> u32 {
         let earlier = candidates.iter().filter(|name| **name < self.name).count();
         let period = self.ticks_per_snapshot;
         period + period.div_ceil(2) + u32::try_from(earlier).unwrap_or(u32::MAX) % period.max(1)
     }
 
-    /// Everything, if the leader is to have it and did not get it a moment ago.
+    /// All evidence, if the leader should have it and has not received it recently.
     fn take_everything(&mut self, ledger: &ReputationLedger, now: Timestamp) -> Vec<LedgerShare> {
         let is_due = self
             .everything_sent_at
@@ -510,7 +528,7 @@ impl LedgerResync {
         shares
     }
 
-    /// All evidence but that of one lane. Where evidence is signed, what a node counted itself counts for nobody while
+    /// All evidence except one lane. If evidence is signed, a node's own counts are not used while
     /// it does not lead.
     fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
         let is_told = |term: u64, aggregator: &NodeName| {
@@ -534,7 +552,7 @@ impl LedgerResync {
         shares
     }
 
-    /// Evidence that nobody has shared with the leader, if it is time to send it.
+    /// Evidence that no candidate has shared with the leader, if it is time to send it.
     fn take_unshared(
         &mut self,
         ledger: &ReputationLedger,
@@ -586,7 +604,7 @@ impl LedgerResync {
                 return vec![together];
             }
         }
-        // Only what is of one lane can be signed.
+        // Evidence can be signed only if it belongs to one lane.
         let is_together =
             |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
         let entries = entries

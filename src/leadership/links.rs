@@ -1,7 +1,7 @@
 //! The brokers that a node keeps links to.
 //!
-//! Reports go out on every link, so that the standby gets them on its own broker. The leader publishes on its own broker
-//! and on the standby's. A link outlives its use by [`LINK_LINGER`].
+//! Reports go out on every link, so that the standby gets them on its own broker. The leader
+//! publishes on its own broker and on the standby's. A link outlives its use by [`LINK_LINGER`].
 
 use std::collections::BTreeSet;
 
@@ -14,8 +14,9 @@ use crate::model::time::Timestamp;
 pub struct DataPlane {
     /// A broker that belongs to no node and is used by all.
     pub external: Option<BrokerAddress>,
-    /// True if the brokers of leader and standby are used. Without an external broker they always are. Beside one they
-    /// are if configured, so that nothing is switched when it goes or returns.
+    /// True if the brokers of leader and standby are used. They always are if there is no external
+    /// broker. In addition to an external broker they are used if configured, so that no switch is
+    /// needed when the external broker fails or returns.
     pub embedded: bool,
 }
 
@@ -24,11 +25,11 @@ pub struct DataPlane {
 pub enum LinkState {
     /// Connected, subscribed, status published.
     Up,
-    /// Connected, but nothing comes back of what is sent: the broker hangs, or its answers are lost.
+    /// Connected, but messages are not echoed: the broker hangs, or its answers are lost.
     Stalled,
-    /// Not connected; attempts go on.
+    /// Not connected; attempts continue.
     Down,
-    /// Not connected, and nothing listens there: the broker's process is gone. Attempts go on.
+    /// Not connected because the port is closed: the broker's process has ended. Attempts continue.
     Refused,
 }
 
@@ -50,16 +51,17 @@ pub struct Brokers {
 pub struct WantedLinks {
     /// All brokers to be linked to.
     pub brokers: Vec<BrokerAddress>,
-    /// Those of them whose reports a candidate takes: all vehicles send to each.
+    /// The subset of brokers whose reports a candidate receives, because vehicles send their
+    /// reports to each of these brokers.
     pub report_brokers: Vec<BrokerAddress>,
 }
 
-/// The links that are wanted, and those that are kept for a while longer.
+/// The wanted links, and links that are kept a little longer.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Links {
     plane: DataPlane,
     present: Brokers,
-    /// Brokers no longer used, and until when their links are kept.
+    /// Brokers no longer in use, with the time until which their links are kept.
     lingering: Vec<(BrokerAddress, Timestamp)>,
     wanted: BTreeSet<BrokerAddress>,
 }
@@ -75,7 +77,7 @@ impl Links {
         }
     }
 
-    /// Notes the brokers of the moment; returns the links to keep if they are others than before.
+    /// Updates the brokers currently in use; returns the links to keep if they have changed.
     pub fn update(&mut self, brokers: Brokers, now: Timestamp) -> Option<WantedLinks> {
         let is_expired = self.lingering.iter().any(|(_, until)| *until <= now);
         if brokers == self.present && !is_expired && !self.wanted.is_empty() {
@@ -124,7 +126,8 @@ impl Links {
         })
     }
 
-    /// Forgets the wanted links, so that the next update tells them: a new gateway does not know them.
+    /// Clears the wanted links, so that the next update returns them: a restarted gateway needs the
+    /// whole list.
     pub fn forget(&mut self) {
         self.wanted.clear();
     }

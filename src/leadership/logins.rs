@@ -1,4 +1,4 @@
-//! Brokers at which this node should be logged in and is not.
+//! Brokers at which this node should be logged in but is not.
 
 use std::collections::BTreeMap;
 
@@ -6,11 +6,11 @@ use crate::leadership::election::MAX_NO_LOGIN;
 use crate::leadership::timers::{HEALTH_PERIOD, LOGIN_TIMEOUT};
 use crate::model::names::NodeName;
 
-/// Looks in a row after which a login counts as missing, or no longer does. Looks are counted instead of time: a node that
-/// was held up itself blames no broker.
+/// Number of consecutive checks after which a login counts as missing, or as restored. Checks are
+/// counted instead of time, so that a node does not report a broker because of its own stall.
 const LOOKS: u128 = LOGIN_TIMEOUT.as_millis() / HEALTH_PERIOD.as_millis();
 
-/// The nodes whose brokers are used, and those at whose brokers a login is missing until there is one again.
+/// The nodes whose brokers are used, and the nodes at whose brokers a login is missing.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Logins {
     nodes: BTreeMap<NodeName, Login>,
@@ -19,13 +19,13 @@ pub(super) struct Logins {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 struct Login {
     is_missing: bool,
-    /// Number of latest looks that found the contrary.
+    /// Number of latest checks with the opposite result.
     contrary_looks: u128,
 }
 
 impl Logins {
-    /// Notes a look at the used brokers and at those of [`Self::missing`]: whether this node is logged in at each. True if
-    /// the missing logins changed.
+    /// Records a check of the used brokers and the brokers in [`Self::missing`]: whether this node
+    /// is logged in at each. Returns true if the set of missing logins changed.
     pub(super) fn look(&mut self, brokers: &BTreeMap<NodeName, bool>) -> bool {
         self.nodes
             .retain(|name, login| login.is_missing || brokers.contains_key(name));
@@ -54,7 +54,7 @@ impl Logins {
         has_changed
     }
 
-    /// Forgets a node that is gone, or has started anew. True if its login was missing.
+    /// Removes a node that has left or restarted. Returns true if its login was missing.
     pub(super) fn forget(&mut self, name: &NodeName) -> bool {
         self.nodes
             .remove(name)
@@ -69,7 +69,7 @@ impl Logins {
             .map(|(name, _)| name)
     }
 
-    /// True if some broker was last seen without a login that is not known to be missing.
+    /// True if the last check found a broker without a login that is not yet reported as missing.
     pub(super) fn is_doubtful(&self) -> bool {
         self.nodes.values().any(|login| login.contrary_looks > 0)
     }
@@ -79,7 +79,7 @@ impl Logins {
 mod tests {
     use super::*;
 
-    /// Looks at the broker of `edge` until they change something.
+    /// Repeats checks of the broker of `edge` until they change the result.
     fn looks(logins: &mut Logins, is_logged_in: bool) -> Option<u128> {
         let brokers = BTreeMap::from([(NodeName::from_static("edge"), is_logged_in)]);
         (1..100).find(|_| logins.look(&brokers))

@@ -1,19 +1,22 @@
-//! The leadership of one node: a machine without clocks or sockets that decides what its actors carry out.
+//! The leadership of one node: a machine without clocks or sockets that decides what its actors
+//! carry out.
 //!
 //! # Call order
 //!
-//! [`LeadershipNode::new`] with the saved term, then [`Input::OwnBroker`] if the node has one. From then on
-//! [`LeadershipNode::handle`] with whatever happens, and with [`Input::Wake`] at [`LeadershipNode::next_deadline`]. The
-//! [`Effect`]s are carried out in order, before the next input. Equal inputs give equal effects.
+//! Call [`LeadershipNode::new`] with the saved term, then pass [`Input::OwnBroker`] if the node has
+//! a broker. From then on call [`LeadershipNode::handle`] with every input, and with
+//! [`Input::Wake`] at [`LeadershipNode::next_deadline`]. Carry out the [`Effect`]s in order, before
+//! the next input. Equal inputs give equal effects.
 //!
 //! # Parts
 //!
-//! [`Election`] decides who leads. [`HealthMonitor`] decides whether the node is fit to, [`Links`] which brokers it needs.
-//! The machine feeds them, and tells the outcome: a handover is prepared here, and a process known to be gone is one whose
-//! established link broke and was refused.
+//! [`Election`] selects the leader. [`HealthMonitor`] decides whether the node is fit to lead, and
+//! [`Links`] which brokers it needs. This machine passes inputs to these parts and returns their
+//! effects. It also prepares handovers, and detects that a process has ended when an established
+//! link broke and a new connection is refused.
 //!
-//! The machine judges no rounds. [`RoundFilter`](crate::leadership::round_filter::RoundFilter) does, where they arrive,
-//! by the [`Leadership`] that this machine tells.
+//! Rounds are not checked here. [`RoundFilter`](crate::leadership::round_filter::RoundFilter)
+//! checks them where they arrive, using the [`Leadership`] that this machine publishes.
 
 mod interface;
 mod members;
@@ -44,7 +47,7 @@ use crate::model::time::Timestamp;
 use crate::wire::{DescriptionStamp, DescriptionStatus, NodeState, NodeStatus};
 use members::Members;
 
-/// Most nodes whose runs are remembered: brokers may tell of any number of names.
+/// Maximum number of nodes whose runs are stored, because brokers may report any number of names.
 const MAX_RUNS: usize = 4096;
 
 /// One node's leadership.
@@ -56,7 +59,7 @@ pub struct LeadershipNode {
     round_period: Duration,
     members: Members,
     monitor: HealthMonitor,
-    /// The parts as the election knows them.
+    /// State of the parts as last reported to the election.
     health: Health,
     was_out_of_reach: bool,
     links: Links,
@@ -66,17 +69,18 @@ pub struct LeadershipNode {
     /// True if these were all of its followers.
     is_deserted: bool,
     own_broker: Option<SocketAddr>,
-    /// Last living run of each node, as brokers tell it.
+    /// Last run of each node that was online, as reported through brokers.
     runs: BTreeMap<NodeName, Uuid>,
-    /// Leaders that a broker's word ended, and their runs by the membership.
+    /// Leaders that were ended by a broker's report, with their runs according to the membership.
     disconnected: BTreeMap<NodeName, Option<u64>>,
     preparation: Option<Preparation>,
-    /// Epoch of the last accepted round: a node without word from the election says that it follows it.
+    /// Epoch of the last accepted round. A node without messages from the election reports that it
+    /// follows this epoch.
     accepted: Option<Epoch>,
-    /// The leadership as told last.
+    /// The leadership as last published.
     leadership: Leadership,
     status: NodeStatus,
-    /// True if the gateway knows the status.
+    /// True if the current status was sent to the gateway.
     is_status_told: bool,
     deadline: Timestamp,
     /// True if sockets are read before timers run, after a late wake-up.
@@ -94,9 +98,10 @@ struct Preparation {
 }
 
 impl LeadershipNode {
-    /// The leadership of a node that starts. `saved_term` is the last [`Effect::PersistTerm`] of earlier runs, 0 without
-    /// any. `before` is the leadership that an earlier machine of this process told: it may have led in that term, and
-    /// there may be no disk that tells.
+    /// Creates the leadership of a node that starts. `saved_term` is the term of the last
+    /// [`Effect::PersistTerm`] of earlier runs, or 0. `before` is the leadership that an earlier
+    /// machine of this process published: it may have led in that term, and the disk may not
+    /// contain it.
     pub fn new(
         settings: NodeSettings,
         saved_term: u64,
@@ -150,7 +155,7 @@ impl LeadershipNode {
         }
     }
 
-    /// Takes in what happened; returns what to do.
+    /// Processes an input; returns the effects to carry out.
     pub fn handle(&mut self, input: Input, now: Timestamp) -> Vec<Effect> {
         if let Input::Wake = input {
             if now.since(self.deadline) > LATE_WAKE && !self.is_draining {
@@ -180,7 +185,7 @@ impl LeadershipNode {
         std::mem::take(&mut self.effects)
     }
 
-    /// Time at which to hand in [`Input::Wake`].
+    /// Time at which to pass [`Input::Wake`].
     pub fn next_deadline(&self) -> Timestamp {
         self.deadline
     }
@@ -194,11 +199,14 @@ impl LeadershipNode {
             .unwrap_or_default()
     }
 
-    /// The election, to be asked.
+    /// Read access to the election.
     pub fn election(&self) -> &Election {
         &self.election
     }
 
+    /// Dispatches an input to the part that handles it. Two kinds of election messages are stopped
+    /// here: messages under another node's name, and `Ready` from a challenger whose broker does
+    /// not serve this node. For example, `MemberDown` removes the member and informs the election.
     fn take(&mut self, input: Input, now: Timestamp) {
         match input {
             Input::Wake => {}
@@ -292,7 +300,7 @@ impl LeadershipNode {
     fn run_timers(&mut self, now: Timestamp) {
         if self.monitor.is_due(now) {
             self.effects.push(Effect::Look);
-            // A vehicle asks only whether a login that it has not heard of is there.
+            // A vehicle only checks whether a login of unclear state is present.
             if !self.is_vehicle_only || self.logins.is_doubtful() {
                 self.effects.push(Effect::AskParts);
             }
@@ -305,6 +313,8 @@ impl LeadershipNode {
         self.carry_out(effects, now);
     }
 
+    /// Converts the election's effects to effects of the node. For example, `Prepare` starts the
+    /// preparation of a handover here instead of in the caller.
     fn carry_out(&mut self, effects: Vec<ElectionEffect>, now: Timestamp) {
         for effect in effects {
             let effect = match effect {
@@ -343,7 +353,8 @@ impl LeadershipNode {
         }
     }
 
-    /// Hands the election what a node may say. A message that declares more still tells what its sender may be.
+    /// Passes a message to the election after limiting it to the sender's rights. A message that
+    /// declares a higher role or priority is not dropped: the permitted part is still used.
     fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
         let (from, declared) = (message.from.clone(), message.candidacy);
         let limited = rights.limit(message);
@@ -380,7 +391,7 @@ impl LeadershipNode {
     fn take_link(&mut self, broker: &BrokerAddress, state: LinkState, now: Timestamp) {
         let is_gone = self.monitor.note_link(broker, state);
         self.update_health(now);
-        // A broker that belongs to no node says nothing about any.
+        // A broker that belongs to no node gives no evidence about any node.
         if is_gone && self.links.plane().external.as_ref() != Some(broker) {
             for peer in self.members.at(broker, now) {
                 self.log(Notice::ProcessGone {
@@ -392,8 +403,10 @@ impl LeadershipNode {
         }
     }
 
-    /// Notes a status. Where all use one broker, its word that the leader's connection broke is the quickest news of the
-    /// leader's end. Any member can give that word: it ends the leader once in each run, and later has it asked about.
+    /// Processes a status. If all nodes use one broker, the broker's report that the leader's
+    /// connection broke is the fastest evidence of the leader's end. Any member can forge this
+    /// report, so it ends the leader only once per run; later reports make this node ask about the
+    /// leader.
     fn take_status(&mut self, status: &NodeStatus, now: Timestamp) {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
@@ -417,8 +430,8 @@ impl LeadershipNode {
         }
     }
 
-    /// Notes an accepted round. Rounds of other epochs than the election's own prove nothing: whoever reaches a broker can
-    /// publish some.
+    /// Records an accepted round. Only rounds of the election's own epoch are evidence, because any
+    /// client of a broker can publish rounds of other epochs.
     fn take_round(&mut self, epoch: Epoch, round: u64, now: Timestamp) {
         if self.election.epoch() == Some(&epoch) {
             self.feed(
@@ -432,8 +445,8 @@ impl LeadershipNode {
         self.accepted = Some(epoch);
     }
 
-    /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
-    /// membership lost without a word.
+    /// Processes a check. The list of members compensates for events before the start, and for
+    /// members that a restarted membership lost without an event.
     fn take_look(
         &mut self,
         rounds_due: u64,
@@ -456,7 +469,8 @@ impl LeadershipNode {
         self.check_logins(now);
     }
 
-    /// Notes whether this node is logged in at the brokers of leader and standby. Beside an external broker it need not be.
+    /// Checks whether this node is logged in at the brokers of leader and standby. With an external
+    /// broker this is not required.
     fn check_logins(&mut self, now: Timestamp) {
         let plane = self.links.plane();
         let needs_none = !plane.embedded
@@ -547,8 +561,9 @@ impl LeadershipNode {
         );
     }
 
-    /// True if this node is logged in at a broker with which the challenger would lead: its own, or an external one. If
-    /// none admits anybody, handing over would silence the cell. The challenger repeats that it is ready.
+    /// True if this node is logged in at a broker with which the challenger would lead: the
+    /// challenger's own broker, or an external broker. If no such broker admits this node, a
+    /// handover would silence the cell. The challenger repeats its `Ready` message.
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         let plane = self.links.plane();
         !plane.embedded
@@ -562,7 +577,8 @@ impl LeadershipNode {
                 .is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
-    /// True if the members reach the broker that this node would lead with; the first time that they do not is logged.
+    /// True if the members reach the broker that this node would lead with; the first time that
+    /// they do not is logged.
     fn is_reached(&mut self, no_other: bool) -> bool {
         let is_private = self
             .own_broker
@@ -592,7 +608,7 @@ impl LeadershipNode {
         self.feed(ElectionInput::Health { health }, now);
     }
 
-    /// Tells leadership, links and status where they changed.
+    /// Returns effects for leadership, links and status if they changed.
     fn tell(&mut self, now: Timestamp) {
         self.tell_leadership();
         let broker = |name: Option<&NodeName>| match name {

@@ -14,9 +14,9 @@ use crate::model::time::Timestamp;
 pub struct Readiness {
     /// True if the node is ready.
     pub ready: bool,
-    /// The reason in words.
+    /// The reason as text.
     pub reason: String,
-    /// True if a start anew may help.
+    /// True if a restart may help.
     #[serde(skip)]
     pub needs_restart: bool,
 }
@@ -36,7 +36,7 @@ impl Readiness {
         }
     }
 
-    /// The readiness of the same node with what may be the cause, if it is not ready.
+    /// The readiness of the same node with a possible cause, if it is not ready.
     #[must_use]
     pub fn because(self, cause: Option<&str>) -> Self {
         match cause {
@@ -48,7 +48,8 @@ impl Readiness {
         }
     }
 
-    /// The readiness of the same node with a problem of its settings, if there is one, which no start anew mends.
+    /// The readiness of the same node with a problem of its settings, if there is one, which a
+    /// restart does not fix.
     #[must_use]
     pub fn unless(self, problem: Option<String>) -> Self {
         match problem {
@@ -61,8 +62,9 @@ impl Readiness {
         }
     }
 
-    /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
-    /// the node publishes. Without a `timeout` rounds are not waited for.
+    /// Determines readiness from the leadership, the epoch and arrival time of the last accepted
+    /// round, and whether a broker carries the node's messages. Without a `timeout`, rounds are not
+    /// required.
     pub fn judge(
         leadership: &Leadership,
         last_round: Option<&(Epoch, Timestamp)>,
@@ -78,7 +80,7 @@ impl Readiness {
             return not("leading without a working broker".into());
         }
         if leadership.is_leading() && leadership.is_deserted {
-            // By the word of others: it must not restart this node.
+            // This depends on other nodes' reports, so it must not restart this node.
             let reason = "leading, but no follower can log in at this node's broker".into();
             return Self {
                 ready: false,

@@ -15,8 +15,8 @@ pub struct Rights {
     pub may_describe: bool,
 }
 
-/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default. The node is no
-/// operator's.
+/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by
+/// default. The node is no operator's.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
         Self {
@@ -28,14 +28,14 @@ impl From<Role> for Rights {
 }
 
 impl Rights {
-    /// The rights of all nodes in a cell without certificates: a node is what it declares.
+    /// The rights of all nodes in a cell without certificates: every declaration is accepted.
     pub const ALL: Self = Self {
         role: Role::Edge,
         priority: u8::MAX,
         may_describe: true,
     };
 
-    /// The rights of a node that never leads.
+    /// The rights of a node that may not lead.
     pub const NONE: Self = Self {
         role: Role::Cav,
         priority: 0,
@@ -56,7 +56,8 @@ impl Rights {
         }
     }
 
-    /// True if a node may declare this role and priority. A priority says nothing about a node that never leads.
+    /// True if a node may declare this role and priority. The priority of a node that may not lead
+    /// is ignored.
     pub fn allow(self, role: Role, priority: u8) -> bool {
         role == Role::Cav || rank(role) <= rank(self.role) && priority <= self.priority
     }
@@ -70,7 +71,8 @@ impl Rights {
         }
     }
 
-    /// The message with role and priority lowered to these rights. `None` if only a node that may lead may send it.
+    /// The message with role and priority lowered to these rights. `None` if only a node that may
+    /// lead may send it.
     pub(crate) fn limit(self, mut message: ElectionMessage) -> Option<ElectionMessage> {
         let claims = matches!(
             message.body,

@@ -1,22 +1,28 @@
-//! Acceptance of rounds: the only place that decides whose rounds a node accepts.
+//! Acceptance of rounds: the only place that decides which leader's rounds a node accepts.
 //!
 //! # Filters
 //!
-//! - [`RoundFilter`] judges each map, verdict and reputation message that arrives. Its owner is the actor that receives
-//!   them, so that no round takes a detour. It reads the [`Leadership`] of the moment and never asks.
-//! - [`PublisherFilter`] is the rule of a node's own broker: who may publish for all.
-//! - [`Leadership::knows_term`] is the rule for evidence, and for maps that a new leader goes on from.
+//! - [`RoundFilter`] checks each map, verdict and reputation message that arrives. It belongs to
+//!   the actor that receives these messages, so that rounds take no detour. It reads the current
+//!   [`Leadership`] and does not query the election.
+//! - [`PublisherFilter`] is the rule of a node's own broker: which nodes may publish for the whole
+//!   cell.
+//! - [`Leadership::knows_term`] is the rule for evidence, and for maps that a new leader continues
+//!   from.
 //!
-//! A round passes four checks in this order: its [`Origin`] is good enough, its epoch and number do not go back
-//! ([`EpochGate`]), its leader is the elected one or may have succeeded it ([`SuccessionFilter`]), and it did not wait in a
-//! queue ([`StalenessFilter`]).
+//! A round passes four checks in this order: its [`Origin`] is sufficient, its epoch and number
+//! don't go back ([`EpochGate`]), its leader is elected or may have succeeded the elected leader
+//! ([`SuccessionFilter`]), and it did not wait in a queue ([`StalenessFilter`]).
 //!
 //! # Invariants
 //!
-//! 1. An accepted round is never accepted again, and never followed by an earlier one of its leadership.
-//! 2. A leader that the election names is refused for [`crate::leadership::timers::SUCCESSOR_CREDIT`] at most.
-//! 3. Once a round of a leadership was proven, none that is only claimed is accepted as of that leadership.
-//! 4. A round older than [`crate::leadership::timers::MAX_ROUND_AGE`] is refused once its leader's delay is known.
+//! 1. An accepted round is not accepted a second time, and not followed by an earlier round of its
+//!    leadership.
+//! 2. A leader named by the election is refused for [`crate::leadership::timers::SUCCESSOR_CREDIT`]
+//!    at most.
+//! 3. Once a round of a leadership was proven, claimed rounds of that leadership are refused.
+//! 4. A round older than [`crate::leadership::timers::MAX_ROUND_AGE`] is refused once its leader's
+//!    delay has been measured.
 
 mod epoch_gate;
 mod origin;
@@ -57,16 +63,18 @@ pub struct AcceptedRound {
     pub epoch: Epoch,
     /// Its number.
     pub round: u64,
-    /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no maps come.
+    /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no
+    /// maps come.
     pub is_sign_of_life: bool,
-    /// True if a new leader may go on from it. While nobody is known to lead, rounds of any term are accepted.
+    /// True if a new leader may continue from this round. While the node has no leader, rounds of
+    /// any term are accepted.
     pub is_known_term: bool,
 }
 
 /// Reason for which a round was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
-    /// It or a later one of the same leadership was accepted: it came another way.
+    /// This round or a later round of the same leadership was accepted before, over another path.
     Repeated,
     /// A round of a later leadership was accepted.
     Superseded,
@@ -81,7 +89,7 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    /// The reason that is counted; none for a repeated round, which is no fault.
+    /// The reason that is counted; `None` for a repeated round, which is not a fault.
     pub fn reject_reason(self) -> Option<RejectReason> {
         match self {
             Self::Repeated => None,
@@ -95,8 +103,8 @@ impl Refusal {
 }
 
 impl RoundFilter {
-    /// A filter of a node that starts. `saved_term` is the last term that an earlier run wrote to disk, 0 without any:
-    /// terms below those that it knew are refused at first.
+    /// Creates the filter of a node that starts. `saved_term` is the last term that an earlier run
+    /// wrote to disk, or 0. Terms below the terms of that run are refused at first.
     pub fn new(saved_term: u64, now: Timestamp) -> Self {
         let floor = floor(saved_term);
         Self {
@@ -105,16 +113,17 @@ impl RoundFilter {
             map_accepted_at: None,
             verdicts: SuccessionFilter::new(floor),
             verdict_age: StalenessFilter::new(now),
-            // Brokers retain them: a node that starts gets them before it can have heard of any term.
+            // Brokers retain reputations: a node that starts receives them before it can have seen
+            // any term.
             reputations: SuccessionFilter::of_retained(floor),
             proven: None,
         }
     }
 
-    /// Accepts a map, or refuses it.
+    /// Accepts or refuses a map.
     ///
     /// # Errors
-    /// The reason for which it is refused.
+    /// Returns the reason for the refusal.
     pub fn accept_map(
         &mut self,
         map: &GlobalMap,
@@ -132,10 +141,10 @@ impl RoundFilter {
         Ok(accepted(epoch, map.round, true, leadership))
     }
 
-    /// Accepts verdicts, or refuses them.
+    /// Accepts or refuses verdicts.
     ///
     /// # Errors
-    /// The reason for which they are refused.
+    /// Returns the reason for the refusal.
     pub fn accept_verdicts(
         &mut self,
         verdicts: &Verdicts,
@@ -160,10 +169,10 @@ impl RoundFilter {
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
 
-    /// Accepts reputations, or refuses them. They are a state, so that age does not matter.
+    /// Accepts or refuses reputations. They are a state, so their age does not matter.
     ///
     /// # Errors
-    /// The reason for which they are refused.
+    /// Returns the reason for the refusal.
     pub fn accept_reputations(
         &mut self,
         reputations: &Reputations,
@@ -198,8 +207,8 @@ impl RoundFilter {
     }
 }
 
-/// Lowest term that a node accepts after a restart: the highest that it knew when it stopped. It writes the next one to
-/// disk before that is needed.
+/// Lowest term that a node accepts after a restart: the highest term that it had seen when it
+/// stopped. The saved term is one higher, because a node writes the next term to disk in advance.
 fn floor(saved_term: u64) -> u64 {
     saved_term.saturating_sub(1)
 }
@@ -231,7 +240,7 @@ fn accepted(
     }
 }
 
-/// Aggregator of reputations that name none; it sorts before all others.
+/// Placeholder aggregator of reputations without one; it sorts before all other names.
 const UNNAMED: NodeName = NodeName::from_static("-");
 
 #[cfg(test)]

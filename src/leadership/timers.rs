@@ -1,52 +1,53 @@
-//! Timing of leadership: every constant in one table, with the relation that each one keeps to others.
+//! Timing of leadership: one table of all constants and the relations between them.
 //!
-//! Settings of `[election]` are in [`ElectionConfig`]; `beat`, `idle_beat`, `silence_beats`, `claim_step` and `handover`
-//! stand for them here. *Round* is the default round period, 100 ms. A test of this file checks every relation.
+//! Settings of `[election]` are in [`ElectionConfig`]; `beat`, `idle_beat`, `silence_beats`,
+//! `claim_step` and `handover` stand for them here. *Round* is the default round period, 100 ms. A
+//! test of this file checks every relation.
 //!
 //! | timer | value | must be | because |
 //! |---|---|---|---|
 //! | `standby_silence` | `beat * silence_beats`, 200 ms | below [`ELECTED_SILENCE`] | a round of the new leader is accepted when it comes |
-//! | `response_timeout` | four of these, 800 ms | above a claim, an answer and a retry | it ends what those concerned do at once |
-//! | `given_up_timeout` | two of these, 400 ms | between both above | the membership's word weighs less than the leader's beats |
+//! | `response_timeout` | four of these, 800 ms | above a claim, an answer and a retry | all nodes concerned have acted by then |
+//! | `given_up_timeout` | two of these, 400 ms | between both above | the membership's report counts less than the leader's beats |
 //! | `ask_period` | one of these, 200 ms | not above an answer's wait | lost questions are repeated in time |
-//! | `answer_time` | `claim_step * 2`, 120 ms | below `ask_period` | who is asked answers before the next question |
-//! | `near_beat` | `beat * 8`, 400 ms | below `response_timeout` | a second successor hears of a new standby in time |
-//! | `contact_timeout` | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat is no lost contact |
-//! | `overdue`, `missing` | 3/2 and 5/2 of a round interval | in this order | doubt comes before loss |
-//! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is no silence |
-//! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | word of the election comes within it |
+//! | `answer_time` | `claim_step * 2`, 120 ms | below `ask_period` | the answer arrives before the next question |
+//! | `near_beat` | `beat * 8`, 400 ms | below `response_timeout` | a second successor receives the new standby in time |
+//! | `contact_timeout` | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat does not end the contact |
+//! | `overdue`, `missing` | 3/2 and 5/2 of a round interval | in this order | suspicion comes before loss |
+//! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is tolerated |
+//! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | election messages arrive within it |
 //! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
-//! | [`LEADER_DELAY_MEMORY`] | 10 s | above [`EPOCH_MEMORY`] | leaders that alternate make no old round fresh |
-//! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the way itself |
-//! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone makes no round stale |
-//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader goes on from maps that others may still accept |
+//! | [`LEADER_DELAY_MEMORY`] | 10 s | above [`EPOCH_MEMORY`] | alternating leaders don't make an old round look fresh |
+//! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the transit time |
+//! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone does not make rounds stale |
+//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader continues from maps that other nodes may still accept |
 //! | [`LIVE_STREAM_TIME`] | 150 ms | above a round | at least two rounds prove a live stream |
-//! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | what receivers may accept a broker passes on |
+//! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | a broker forwards every round that receivers may accept |
 //! | [`LINK_LINGER`] | 2 s | above [`FAREWELL_TIME`] | the last round finds a link |
-//! | [`HEALTH_PERIOD`] | 250 ms | below half of [`PART_TIMEOUT`] | two looks see a part's end |
-//! | [`LOOK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late look on a busy machine is still time |
+//! | [`HEALTH_PERIOD`] | 250 ms | below half of [`PART_TIMEOUT`] | two checks detect a part's end |
+//! | [`LOOK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late check on a busy machine still counts as time |
 //! | [`ANSWER_STEP`] times [`ANSWER_STEPS`] | 1 s | below [`PART_TIMEOUT`] | a hung part shows before its rounds do |
 //! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
-//! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part as long as two looks |
+//! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part for up to two checks |
 //! | [`ECHO_TIMEOUT`] | 800 ms | above [`MIN_UNANSWERED`] rounds | both conditions hold at about the same time |
-//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::aggregator::round::CONNECT_TIME`] | a planned handover waits for everybody |
-//! | [`LOGIN_TIMEOUT`] | 2 s | below `stable`, a multiple of [`HEALTH_PERIOD`] | nobody is handed a lead in vain |
+//! | [`VEHICLE_CONNECT_TIME`] | 300 ms | above [`crate::aggregator::round::CONNECT_TIME`] | a planned handover waits for all vehicles |
+//! | [`LOGIN_TIMEOUT`] | 2 s | below `stable`, a multiple of [`HEALTH_PERIOD`] | the new leader's broker is reachable before the handover |
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
 //! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
 //! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
-//! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself is no late timer |
-//! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
-//! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
+//! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself does not make a timer late |
+//! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is attributed to its node after the node was given up |
+//! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a restart of the membership does not end a leadership |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
 //! | [`RENEWAL_PAUSE`] | 10 s | above `response_timeout` | a follower that refuses each epoch does not wear out terms |
-//! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, whoever states them |
-//! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader is told before it shares all it knows again |
+//! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, from any source |
+//! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader gets all evidence before its own next snapshot |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
-//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a node follows a false claimant for less |
-//! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
+//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a false claimant is followed for a shorter time |
+//! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from the far future would block all later resets |
 //! | `LIFE_SIGN_STEP_MS` | 10 ms | below a beat | signs of life are dated closely, and signed rarely |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
-//! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
+//! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age shows whether it was stamped before or after a jump |
 //! | [`MAX_CLOCK_SLEW`] | 0.5 % | above the drift of two clocks, 0.01 % | the cell's time catches up with the median |
 
 use std::time::Duration;
@@ -56,38 +57,43 @@ use crate::leadership::config::ElectionConfig;
 /// Maximum age of a round that a node accepts.
 pub const MAX_ROUND_AGE: Duration = Duration::from_secs(1);
 
-/// Maximum time that a round spent in queues. The shortest way itself is not known, only the time beyond it.
+/// Maximum time that a round spent in queues, in addition to the unknown transit time of the
+/// shortest path.
 pub const MAX_ROUND_WAIT: Duration = Duration::from_millis(900);
 
-/// Maximum age of the map whose objects a new leader goes on with.
+/// Maximum age of the map from whose objects a new leader continues.
 pub const MAX_ADOPTED_MAP_AGE: Duration = Duration::from_secs(1);
 
-/// Time for which rounds arrive no faster than they were made before their delay counts as that of a live stream.
+/// Time for which rounds must arrive no faster than they were made before their delay counts as the
+/// delay of a live stream.
 pub const LIVE_STREAM_TIME: Duration = Duration::from_millis(150);
 
 /// Time after its last round for which the delay of a leader's rounds is remembered.
 pub const LEADER_DELAY_MEMORY: Duration = Duration::from_secs(10);
 
-/// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged epoch silences a leader.
+/// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged
+/// epoch silences a leader.
 pub const EPOCH_MEMORY: Duration = Duration::from_secs(3);
 
 /// Silence after which a later epoch is accepted from a node other than the standby.
 pub const ELECTED_SILENCE: Duration = Duration::from_millis(250);
 
-/// Time for which a later epoch is believed while the election names another leader: its word may be on the way.
+/// Time for which a later epoch is accepted while the election names another leader: the election's
+/// messages may still be in transit.
 pub const SUCCESSOR_CREDIT: Duration = Duration::from_millis(500);
 
 /// Time after its last message for which a superseded leader may still publish at a broker.
 pub const FAREWELL_TIME: Duration = Duration::from_secs(1);
 
-/// Time for which a link outlives its use: vehicles that are not yet linked to the new leader's broker are served by the
-/// old one's.
+/// Time for which a link outlives its use: vehicles that are not yet linked to the new leader's
+/// broker are served by the old one's.
 pub const LINK_LINGER: Duration = Duration::from_secs(2);
 
-/// Time between two looks at the own parts.
+/// Time between two checks of the node's own parts.
 pub const HEALTH_PERIOD: Duration = Duration::from_millis(250);
 
-/// Lateness of a look that still counts as time; more means that the whole node was held up.
+/// Lateness of a check that still counts as time; a longer delay means that the whole node was
+/// stalled.
 pub const LOOK_TOLERANCE: Duration = Duration::from_millis(500);
 
 /// One step of the wait for a part's answer; a stop of the whole node takes up one step only.
@@ -102,27 +108,29 @@ pub const PART_TIMEOUT: Duration = Duration::from_secs(2);
 /// Steps for which readiness waits for a part's answer.
 pub const READINESS_STEPS: usize = 5;
 
-/// Time without an echo after which a broker counts as stalled. Six busy loops on two processors delay a broker by some
-/// tens of milliseconds.
+/// Time without an echo after which a broker counts as stalled. Six busy loops on two processors
+/// delay a broker by some tens of milliseconds.
 pub const ECHO_TIMEOUT: Duration = Duration::from_millis(800);
 
-/// Number of messages without an echo, sent over [`ECHO_TIMEOUT`], after which a broker counts as stalled.
+/// Number of messages without an echo, sent over [`ECHO_TIMEOUT`], after which a broker counts as
+/// stalled.
 pub const MIN_UNANSWERED: u32 = 6;
 
 /// Time given to vehicles to connect to the broker of a node that is about to be handed the lead.
 pub const VEHICLE_CONNECT_TIME: Duration = Duration::from_millis(300);
 
-/// Time without a login at a broker after which a node says so: a connection that is made anew takes less, also when its
-/// first packet is lost.
+/// Time without a login at a broker after which a node reports it. Reconnecting takes less time,
+/// even if the first packet is lost.
 pub const LOGIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Time for which a node that is about to be handed the lead waits for the old leader's evidence.
 pub const LEDGER_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Time between two checks of what a handover waits for.
+/// Time between two checks of the conditions for a handover.
 pub const PREPARATION_STEP: Duration = Duration::from_millis(50);
 
-/// Lateness of a wake-up that means that the process stalled: sockets are read for [`DRAIN_TIME`] first.
+/// Lateness of a wake-up that means that the process stalled: sockets are read for [`DRAIN_TIME`]
+/// first.
 pub const LATE_WAKE: Duration = Duration::from_millis(20);
 
 /// Time for which sockets are read after a late wake-up before timers run.
@@ -134,16 +142,20 @@ pub const DEPARTED_TIME: Duration = Duration::from_secs(5);
 /// Time for a restarted membership to find its members again.
 pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
 
-/// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
+/// Time for which a node waits for its disk: for its term before it leads, for reputations before
+/// it publishes them.
 pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Longest pause between two renewals of a leadership that followers refuse. The first is `given_up_timeout`.
+/// Longest pause between two renewals of a leadership that followers refuse. The first is
+/// `given_up_timeout`.
 pub const RENEWAL_PAUSE: Duration = Duration::from_secs(10);
 
-/// Time in which the known term rises by [`MAX_TERM_STEP`](crate::leadership::election::MAX_TERM_STEP) at most.
+/// Time within which the highest seen term rises by
+/// [`MAX_TERM_STEP`](crate::leadership::election::MAX_TERM_STEP) at most.
 pub const TERM_WINDOW: Duration = Duration::from_secs(3600);
 
-/// Least time between two transfers of all evidence to new leaders: leaders may seem to come and go fast.
+/// Minimum time between two transfers of all evidence to new leaders, in case leaders appear and
+/// disappear quickly.
 pub const FULL_RESYNC_PAUSE: Duration = Duration::from_secs(5);
 
 /// Time for which the stamps of a node are compared to later ones.
@@ -158,16 +170,18 @@ pub const MAX_CLOCK_SLEW: i64 = 5_000;
 /// Time after the end of a leadership in which evidence that its leader sends is still accepted.
 pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
 
-/// Time for which a leader is followed without another before others pass its evidence on.
+/// Time for which a leader must be followed without interruption before other nodes pass its
+/// evidence on.
 pub const EVIDENCE_TRIAL: Duration = Duration::from_secs(20);
 
-/// Maximum time by which the clock of the node that forgot all evidence may be ahead of this node's.
+/// Maximum time by which the clock of the node that reset all evidence may be ahead of this node's.
 pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
 
-/// Number of round intervals after the last round when rounds no longer count as regular.
+/// Number of round intervals after the last round when rounds stop counting as regular.
 pub(crate) const REGULAR_GAPS: u32 = 8;
 
-/// Step in ms of the time that a leader states in its signs of life: it signs a hundred a second at most.
+/// Step in ms of the time that a leader states in its signs of life: it signs a hundred a second at
+/// most.
 pub(crate) const LIFE_SIGN_STEP_MS: u64 = 10;
 
 /// Maximum number of questions about the leader that wait for its next sign of life.
@@ -197,7 +211,8 @@ impl ElectionConfig {
         self.standby_silence() * 4
     }
 
-    /// Silence after which a node that the membership gave up is lost, and wait before a refused epoch is renewed.
+    /// Silence after which a node that the membership gave up is lost, and wait before a refused
+    /// epoch is renewed.
     pub(crate) fn given_up_timeout(&self) -> Duration {
         self.response_timeout() / 2
     }
@@ -212,7 +227,7 @@ impl ElectionConfig {
         self.claim_step() * 2
     }
 
-    /// Time for which a peer that gets idle beats may be silent and still count as heard.
+    /// Time for which a peer that gets idle beats may be silent and still count as reachable.
     pub(crate) fn contact_timeout(&self) -> Duration {
         self.idle_beat() * 5 / 2
     }
@@ -222,7 +237,8 @@ impl ElectionConfig {
         (self.beat() * NEAR_BEATS).min(self.idle_beat())
     }
 
-    /// Time between two offers of the lead; after the last round between two messages that yield it, a quarter.
+    /// Time between two offers of the lead; after the last round between two messages that yield
+    /// it, a quarter.
     pub(crate) fn handover_retry(&self, has_yielded: bool) -> Duration {
         if has_yielded {
             self.beat() / 4

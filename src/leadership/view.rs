@@ -6,7 +6,7 @@ use crate::leadership::election::Election;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 
-/// The leader and its standby, as one node sees them.
+/// The leader and its standby, as seen by one node.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct Leadership {
     /// The node's own place in its cell.
@@ -15,11 +15,13 @@ pub struct Leadership {
     pub epoch: Option<Epoch>,
     /// The next leader, if the leader has named one; it may be this node.
     pub standby: Option<NodeName>,
-    /// Highest term that the election knows to have been used.
+    /// Highest term that the election has seen in use.
     pub term: u64,
-    /// True if this node leads, and no follower can log in at its broker. A change alone wakes nobody.
+    /// True if this node leads and all its followers are unable to log in at its broker. A change
+    /// of only this field does not notify readers.
     pub is_deserted: bool,
-    /// True if this node leads, and the next round is its standby's. A change alone wakes nobody.
+    /// True if this node leads and its standby publishes the next round. A change of only this
+    /// field does not notify readers.
     pub is_yielding: bool,
 }
 
@@ -27,12 +29,12 @@ pub struct Leadership {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Position {
-    /// It knows of no leader.
+    /// The node has no leader.
     #[default]
     Seeking,
     /// It follows the epoch's leader.
     Following,
-    /// It follows, and leads next.
+    /// It follows, and is the next leader.
     StandingBy,
     /// It leads.
     Leading,
@@ -57,12 +59,12 @@ impl Leadership {
         }
     }
 
-    /// The leader; none while the node seeks.
+    /// The leader; `None` while the node seeks.
     pub fn leader(&self) -> Option<&NodeName> {
         self.present_epoch().map(|epoch| &epoch.leader)
     }
 
-    /// The epoch followed or led now; none while the node seeks.
+    /// The epoch followed or led now; `None` while the node seeks.
     pub fn present_epoch(&self) -> Option<&Epoch> {
         self.epoch
             .as_ref()
@@ -74,7 +76,8 @@ impl Leadership {
         self.position == Position::Leading
     }
 
-    /// True if the election knows that a term was used. Only what nodes say with the cell's key makes a term known.
+    /// True if the election has seen a term in use. Only messages authenticated with the cell's key
+    /// count.
     pub fn knows_term(&self, term: u64) -> bool {
         term <= self.term
     }

@@ -82,7 +82,8 @@ pub struct Detection {
     pub confidence: f64,
     /// Bounds in the image, in pixels.
     pub bounding_box: BoundingBox,
-    /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom right, bottom left.
+    /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom
+    /// right, bottom left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub corners: Option<[Point2<f64>; 4]>,
 }
@@ -90,7 +91,7 @@ pub struct Detection {
 /// Reads the detections of one frame from a line of a recording, a JSON array.
 ///
 /// # Errors
-/// A description of the first flaw.
+/// Returns a description of the first flaw.
 pub fn parse_detections(line: &str) -> Result<Vec<Detection>, String> {
     let detections: Vec<Detection> =
         serde_json::from_str(line).map_err(|error| error.to_string())?;

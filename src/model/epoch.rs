@@ -1,7 +1,8 @@
 //! Leaderships and their order.
 //!
-//! On the wire an [`Epoch`] is two fields: `epoch` is [`Epoch::term`] and `aggregator` is [`Epoch::leader`]. Two sides
-//! of a split network may use the same term; the name makes their epochs different, and the pair orders them all.
+//! On the wire an [`Epoch`] is two fields: `epoch` is [`Epoch::term`] and `aggregator` is
+//! [`Epoch::leader`]. Two sides of a split network may use the same term; the name makes their
+//! epochs different, and the pair orders them all.
 
 use std::fmt;
 
@@ -27,7 +28,8 @@ use crate::model::names::NodeName;
     JsonSchema,
 )]
 pub struct Epoch {
-    /// Counts up with every leadership that a component of the network has seen; the `epoch` of maps and verdicts.
+    /// Counts up with every leadership that a component of the network has seen; the `epoch` of
+    /// maps and verdicts.
     #[n(0)]
     pub term: u64,
     /// The leading node; the `aggregator` of maps and verdicts.

@@ -32,7 +32,8 @@ impl Pose {
             )
     }
 
-    /// Metres ahead and to the left of this pose of a world point: the inverse of [`Self::transform`].
+    /// Metres ahead and to the left of this pose of a world point: the inverse of
+    /// [`Self::transform`].
     pub fn ahead_left(&self, point: &Point2<f64>) -> Vector2<f64> {
         let (sin, cos) = self.heading_rad.sin_cos();
         let offset = point - self.position;
@@ -42,7 +43,8 @@ impl Pose {
         )
     }
 
-    /// Range in metres and bearing in radians, wrapped to (-π, π] and relative to the heading, of a world point.
+    /// Range in metres and bearing in radians, wrapped to (-π, π] and relative to the heading, of a
+    /// world point.
     pub fn range_bearing(&self, point: &Point2<f64>) -> (f64, f64) {
         let offset = point - self.position;
         (
@@ -105,7 +107,8 @@ impl Covariance {
         finite && self.xx >= 0.0 && self.yy >= 0.0 && square <= product * (1.0 + ROUNDING)
     }
 
-    /// Squared Mahalanobis distance of `offset`, with `floor_m` added as an isotropic standard deviation.
+    /// Squared Mahalanobis distance of `offset`, with `floor_m` added as an isotropic standard
+    /// deviation.
     pub fn mahalanobis_squared(&self, offset: &Vector2<f64>, floor_m: f64) -> f64 {
         let floor = floor_m * floor_m;
         let (xx, yy) = (self.xx + floor, self.yy + floor);

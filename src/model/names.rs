@@ -10,7 +10,7 @@ use smol_str::SmolStr;
 /// Longest accepted name, label or landmark id in bytes.
 pub const MAX_NAME_BYTES: usize = 64;
 
-/// Mark between a node's name and that of its part, such as a program beside it.
+/// Separator between a node's name and the name of its part, such as a program that runs with it.
 pub const PART_MARK: &str = "--";
 
 /// A name that is not made of 1 to 64 of the characters `A-Z a-z 0-9 _ -`.
@@ -28,15 +28,15 @@ impl NodeName {
     /// Checks and takes a name.
     ///
     /// # Errors
-    /// [`InvalidName`] when a character or the length is not allowed.
+    /// Returns an [`InvalidName`] if a character or the length is not allowed.
     pub fn new(name: impl AsRef<str>) -> Result<Self, InvalidName> {
         Self::try_from(SmolStr::new(name))
     }
 
-    /// A name known at compile time.
+    /// Creates a name at compile time.
     ///
     /// # Panics
-    /// When the name is not allowed.
+    /// Panics if the name is not allowed.
     pub const fn from_static(name: &'static str) -> Self {
         let bytes = name.as_bytes();
         assert!(
@@ -59,7 +59,8 @@ impl NodeName {
         &self.0
     }
 
-    /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the name itself.
+    /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the
+    /// name itself.
     #[must_use]
     pub fn vehicle(&self) -> Self {
         match self.0.split_once(PART_MARK) {
@@ -114,10 +115,11 @@ impl fmt::Debug for NodeName {
 /// A class label or decoded text, such as `car` or `ABCD123`. Cheap to clone.
 pub type Label = SmolStr;
 
-/// The id of a known location, such as `slot-0`. Cheap to clone.
+/// The id of a landmark, such as `slot-0`. Cheap to clone.
 pub type LandmarkId = SmolStr;
 
-/// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+/// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without
+/// control characters.
 pub fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && is_plain_text(text)
 }
@@ -127,7 +129,8 @@ pub fn is_plain_text(text: &str) -> bool {
     !text.chars().any(|c| c.is_control() || is_layout_control(c))
 }
 
-/// A text as [`is_plain_text`] wants it, of at most so many bytes: control characters become spaces.
+/// A text that satisfies [`is_plain_text`], of at most `max_bytes` bytes: control characters become
+/// spaces.
 pub fn plain_text(text: &str, max_bytes: usize) -> String {
     let plain = |c: char| {
         if c.is_control() || is_layout_control(c) {
@@ -146,8 +149,8 @@ pub fn plain_text(text: &str, max_bytes: usize) -> String {
     kept
 }
 
-/// True if a character breaks lines or turns the direction of the text around it: a label with one would show another's
-/// text on pages and terminals (Unicode Technical Report 36, section 2.7).
+/// True if a character breaks lines or turns the direction of the text around it: a label with one
+/// would show another's text on pages and terminals (Unicode Technical Report 36, section 2.7).
 fn is_layout_control(c: char) -> bool {
     matches!(c, '\u{61C}' | '\u{200E}' | '\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
 }

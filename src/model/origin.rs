@@ -1,8 +1,8 @@
 //! The place of a cell's frame on Earth, and positions and poses in WGS 84.
 //!
-//! The frame is the tangent plane: it touches Earth's curve at the origin, x and y lie in it, and z is the height above
-//! it. Within 5 km of the origin x and y are distances along the ground to 1 mm, and the ground is s²/2R below the
-//! plane: 2 m at s = 5 km.
+//! The frame is the tangent plane: it touches Earth's curve at the origin, x and y lie in it, and z
+//! is the height above it. Within 5 km of the origin x and y are distances along the ground to 1
+//! mm, and the ground is s²/2R below the plane: 2 m at s = 5 km.
 
 use map_3d::{Ellipsoid, enu2geodetic, enu2uvw, geodetic2enu, uvw2enu};
 use minicbor::{Decode, Encode};
@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check_range};
 use crate::model::geometry::{Pose, wrap_angle};
 
-/// Maximum distance of a pose from the origin in metres. Farther away x and y are no distances on the ground any more:
-/// 4 m less at this distance.
+/// Maximum distance of a pose from the origin in metres. Farther away x and y are no distances on
+/// the ground any more: 4 m less at this distance.
 const MAX_DISTANCE_M: f64 = 1e5;
 
 /// Geographic origin of the east-north frame, in WGS 84.
@@ -55,8 +55,8 @@ pub struct GeographicPose {
     pub latitude_deg: f64,
     /// Longitude in degrees, east positive.
     pub longitude_deg: f64,
-    /// Height above the ellipsoid in metres; without one, that of the cell's origin. At 5 km from the origin, an error of
-    /// 10 m moves the vehicle by 8 mm.
+    /// Height above the ellipsoid in metres; if absent, the height of the cell's origin. At 5 km
+    /// from the origin, an error of 10 m moves the vehicle by 8 mm.
     pub height_m: Option<f64>,
     /// Heading in degrees, clockwise from true north.
     pub azimuth_deg: f64,
@@ -66,7 +66,7 @@ impl GeographicPose {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("latitude_deg", self.latitude_deg, -90.0, 90.0)?;
         check_range("longitude_deg", self.longitude_deg, -180.0, 180.0)?;
@@ -110,7 +110,7 @@ impl StatedPose {
     /// The pose in a frame with this origin.
     ///
     /// # Errors
-    /// [`PoseError`] for a pose on Earth without an origin, or far from it.
+    /// Returns a [`PoseError`] for a pose on Earth without an origin, or far from it.
     pub fn in_map(&self, origin: Option<&GeographicOrigin>) -> Result<Pose, PoseError> {
         match self {
             Self::InMap(pose) => Ok(*pose),
@@ -123,7 +123,7 @@ impl GeographicOrigin {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("latitude_deg", self.latitude_deg, -90.0, 90.0)?;
         check_range("longitude_deg", self.longitude_deg, -180.0, 180.0)?;
@@ -168,11 +168,11 @@ impl GeographicOrigin {
         Point3::new(east * cos + north * sin, north * cos - east * sin, up)
     }
 
-    /// The pose in the frame of a pose on Earth. North there and north at the origin are different directions, except on
-    /// one meridian.
+    /// The pose in the frame of a pose on Earth. North there and north at the origin are different
+    /// directions, except on one meridian.
     ///
     /// # Errors
-    /// [`PoseError::TooFar`] at more than 100 km from the origin.
+    /// Returns [`PoseError::TooFar`] at more than 100 km from the origin.
     pub fn pose_to_map(&self, pose: &GeographicPose) -> Result<Pose, PoseError> {
         let GeographicPose {
             latitude_deg,

@@ -1,7 +1,7 @@
 //! Tiles of Earth's surface, named by quadkeys.
 //!
-//! Source: Microsoft, "Bing Maps Tile System": Web Mercator, each digit 0 to 3 a quarter of the tile before it, x
-//! eastward and y southward.
+//! Source: Microsoft, "Bing Maps Tile System": Web Mercator, each digit 0 to 3 a quarter of the
+//! tile before it, x eastward and y southward.
 
 use std::f64::consts::PI;
 use std::fmt;
@@ -9,16 +9,18 @@ use std::str::FromStr;
 
 use crate::model::origin::{GeographicOrigin, GeographicPosition};
 
-/// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of latitude.
+/// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of
+/// latitude.
 pub const CELL_TILE_DIGITS: u8 = 15;
 
-/// Largest latitude in degrees of the projection; tiles of places beyond it are those at it.
+/// Maximum latitude of the projection in degrees; places beyond it get the tile at this latitude.
 const MAX_LATITUDE_DEG: f64 = 85.051_128_78;
 
 /// Maximum digits of a tile.
 const MAX_DIGITS: usize = 30;
 
-/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first. Without digits: the whole map.
+/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first. Without
+/// digits: the whole map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Quadkey {
     digits: u8,
@@ -70,7 +72,8 @@ impl Quadkey {
         )
     }
 
-    /// This tile and those that touch it: nine, or fewer at the ends of the map in the north and south.
+    /// This tile and the adjacent tiles: nine, or fewer at the northern and southern ends of the
+    /// map.
     pub fn with_neighbours(self) -> Vec<Self> {
         let tiles = 1_i64 << self.digits;
         let at = |dx: i64, dy: i64| {
@@ -96,7 +99,7 @@ impl Quadkey {
         self.digits
     }
 
-    /// The tile of so many digits, at most its own, that this one is in.
+    /// The enclosing tile with this number of digits, at most this tile's own.
     #[must_use]
     pub fn outer(self, digits: u8) -> Self {
         let fewer = self.digits.saturating_sub(digits);

@@ -1,4 +1,4 @@
-//! Points in time as Unix microseconds; the core never reads a clock, it is told.
+//! Points in time as Unix microseconds. The core reads no clock; callers pass the time.
 
 use std::fmt;
 use std::ops::{Add, Sub};

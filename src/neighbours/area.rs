@@ -1,4 +1,4 @@
-//! The area of which a cell may tell.
+//! The area in which a cell may report objects.
 
 use super::COVER_M;
 use crate::model::origin::GeographicPosition;
@@ -32,7 +32,7 @@ impl CoveredArea {
         }
     }
 
-    /// True if a cell of the tile may tell of a place.
+    /// True if a cell of the tile may report objects at a place.
     pub fn covers(&self, place: &GeographicPosition) -> bool {
         let north_deg = place.latitude_deg - self.middle_deg[0];
         let east_deg = (place.longitude_deg - self.middle_deg[1] + 180.0).rem_euclid(360.0) - 180.0;

@@ -1,4 +1,4 @@
-//! The area of which a cell knows.
+//! The area that a cell's own maps cover.
 
 use std::time::Duration;
 
@@ -6,7 +6,8 @@ use nalgebra::Point2;
 
 use crate::model::time::Timestamp;
 
-/// The rectangle about all that a cell's maps had in the last one to two spans of 30 s; the origin before there is any.
+/// The rectangle around all places in the cell's maps of the last one to two spans of 30 s;
+/// initially the origin.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Extent {
     span_start: Timestamp,

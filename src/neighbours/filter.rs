@@ -13,33 +13,37 @@ use crate::wire::{CellMap, RegionTopic, RegionTopicKind, RejectReason};
 /// Maximum age of a map, and of the objects in it. At 2 Hz it outlives the loss of one map.
 pub const MAX_AGE: Duration = Duration::from_millis(1500);
 
-/// Time without a shorter delay from which the least one counts. Delays of a burst of old maps get shorter and shorter.
+/// Time without a shorter delay from which the least one counts. Delays of a burst of old maps get
+/// shorter and shorter.
 const SETTLES_AFTER: Duration = Duration::from_secs(1);
 
-/// Difference of delays in microseconds that is no news.
+/// Differences of delays below this value, in microseconds, count as jitter.
 const JITTER_US: i64 = 100_000;
 
-/// Silence after which a cell is forgotten, with its epoch.
+/// Silence after which a cell and its epoch are dropped.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(60);
 
-/// Span over which delays are remembered, to tell a backlog that lasts from clocks.
+/// Time span for which delays are stored, to distinguish a lasting backlog from a clock offset.
 const BACKLOG_SPAN: Duration = Duration::from_secs(120);
 
-/// Time between two looks for a backlog.
+/// Time between two checks for a backlog.
 const BACKLOG_PERIOD: Duration = Duration::from_secs(1);
 
 /// Minimum number of cells that show a backlog.
 const MIN_BACKLOG_CELLS: usize = 3;
 
-/// Admits maps of cells: each newer than the one before by epoch and round, and none older than [`MAX_AGE`].
+/// Admits maps of cells: each must be newer than the previous map by epoch and round, and no older
+/// than [`MAX_AGE`].
 ///
-/// The clocks of cells differ. A map's age is therefore its delay beyond the least that maps of this cell take. It goes by
-/// the sender's clock or by the cell's time, whichever makes it younger: the one may be new, the other may jump. While
-/// neither is known, no map counts: for a second from the first map of a cell on.
+/// The clocks of cells differ. A map's age is therefore its delay in excess of the least delay of
+/// this cell's maps. The delay is measured by the sender's clock and by the cell's time, and the
+/// lower age is used: the sender may be new, and the cell's time may jump. Until one of the two
+/// least delays is established, about a second after a cell's first map, its maps are ignored.
 ///
-/// A backlog that lasts looks like a clock that is as much behind. But clocks of cells do not change together. So a delay is a
-/// backlog if three quarters of the cells, and three at least, have it. It adds to the age of each map that is as late, for two
-/// to four minutes.
+/// A lasting backlog looks like a clock that is behind by the same time. However, the clocks of
+/// different cells do not change together. A delay is therefore a backlog if three quarters of the
+/// cells, and at least three cells, have it. The backlog is added to the age of each map with that
+/// delay, for two to four minutes.
 #[derive(Debug, Clone)]
 pub struct CellMapFilter {
     max_cells: usize,
@@ -71,15 +75,15 @@ struct CellOrder {
 #[derive(Debug, Clone)]
 struct DelayEstimate {
     least: MinimumDelay,
-    /// The least one of the last minutes.
+    /// The least delay of the last minutes.
     least_long: MinimumDelay,
-    /// A delay in microseconds of late, and since when none was much shorter.
+    /// A recent delay in microseconds, and the time since which no delay was much shorter.
     usual_us: i64,
     since: Timestamp,
 }
 
 impl CellMapFilter {
-    /// A filter for so many cells at most.
+    /// Creates a filter for at most `max_cells` cells.
     pub fn new(max_cells: usize) -> Self {
         Self {
             max_cells,
@@ -89,10 +93,12 @@ impl CellMapFilter {
         }
     }
 
-    /// Admits a map that came on `topic` and was read at `received_at` by this node's steady clock.
+    /// Admits a map that was received on `topic` and read at `received_at` by this node's steady
+    /// clock.
     ///
     /// # Errors
-    /// The reason why it does not count; at most the estimate of that cell's clock has changed.
+    /// Returns the reason why the map is ignored. In this case only the estimate of that cell's
+    /// clock may have changed.
     pub fn admit(
         &mut self,
         topic: &RegionTopic,
@@ -154,7 +160,8 @@ impl CellMapFilter {
         }
     }
 
-    /// The delay beyond that of the last minutes that three quarters of the cells share.
+    /// The recent additional delay, compared to the last minutes, that three quarters of the cells
+    /// share.
     fn find_backlog(&self, now: Timestamp) -> Duration {
         let heard = self
             .cells
@@ -168,13 +175,13 @@ impl CellMapFilter {
         common.copied().unwrap_or_default()
     }
 
-    /// Forgets cells that have been silent for a minute.
+    /// Drops cells that have been silent for a minute.
     pub fn forget_silent(&mut self, now: Timestamp) {
         self.cells
             .retain(|_, order| now.since(order.received_at) <= FORGOTTEN_AFTER);
     }
 
-    /// True if a map of the cell came lately.
+    /// True if a map of the cell arrived recently.
     pub fn knows(&self, cell: &NodeName) -> bool {
         self.cells.contains_key(cell)
     }
@@ -193,7 +200,8 @@ impl CellOrder {
         }
     }
 
-    /// The least delay of late beyond that of the last minutes, by the clock that makes it shorter; none for jitter.
+    /// The recent least delay in excess of the least delay of the last minutes, by the clock for
+    /// which it is smaller; zero for jitter.
     fn lag(&self) -> Duration {
         let lag_us = self.by_sender.lag_us().min(self.by_cell.lag_us());
         Duration::from_micros(if lag_us > JITTER_US {
@@ -215,7 +223,8 @@ impl DelayEstimate {
         }
     }
 
-    /// Takes a delay; returns what it is beyond the least one, if that is known.
+    /// Records a delay; returns its excess over the least delay, once the least delay is
+    /// established.
     fn observe(&mut self, delay_us: i64, now: Timestamp) -> Option<Duration> {
         self.least.observe(delay_us, now);
         self.least_long.observe(delay_us, now);
@@ -229,7 +238,7 @@ impl DelayEstimate {
             .then(|| Duration::from_micros(beyond_us.unsigned_abs()))
     }
 
-    /// The least delay of late beyond that of the last minutes, in microseconds.
+    /// The recent least delay in excess of the least delay of the last minutes, in microseconds.
     fn lag_us(&self) -> i64 {
         self.least.least().saturating_sub(self.least_long.least())
     }

@@ -16,7 +16,7 @@ pub(super) struct FrameChange {
 
 impl FrameChange {
     pub(super) fn new(from: &GeographicOrigin, own: &GeographicOrigin) -> Self {
-        // The angle is the same for all of the frame to 1 µrad within a kilometre.
+        // Within a kilometre, the angle is constant throughout the frame to 1 µrad.
         let place = |x_m| own.to_map(&from.to_wgs84(x_m, 0.0, 0.0)).xy();
         let east = place(100.0) - place(0.0);
         Self {

@@ -1,16 +1,25 @@
-//! The exchange of cells about vehicles: whom a leader asks about, whom it tells about, and when.
+//! The exchange of vehicle counts between cells: which vehicles a leader subscribes to, which
+//! counts it publishes, and when.
 //!
-//! Each cell has one retained message for each vehicle. It states absolute counts of the cell's own evidence, and never what it
-//! heard of others. Nothing is sent here: [`ReputationExchange::next`] returns what is to be done.
+//! Each cell has one retained message per vehicle. The message states absolute counts of the cell's
+//! own evidence, and does not include counts received from other cells. This module sends no
+//! messages: [`ReputationExchange::next`] returns the steps to carry out.
 //!
-//! - *In.* A leader subscribes to what all cells say of the vehicles that are present, and of no others.
-//! - *Out.* A present vehicle's counts are sent when they say something new, those of one that has left when they differ at all.
-//! - *Kept.* Counts wait until the region has them: the own message comes back. A broker may pass a message on that it then fails to
-//!   keep. So the region is asked once more, some seconds later. Without connection only the latest counts of each vehicle wait.
-//! - *Never less.* A leader that knows less than the region does, such as one that lost its disk, first hears what its cell said
-//!   before, and sends the larger of every count. What it hears too late it puts right.
-//! - *News.* The first word of a cell about a vehicle that is present is due at once, further counts are gathered for a second.
-//! - *Resets.* A leader that missed a reset of its cell's evidence adds to what the region has only what it counts from then on.
+//! - *In.* A leader subscribes to all cells' counts of the vehicles that are present, and only of
+//!   these.
+//! - *Out.* The counts of a present vehicle are sent when they contain enough news; those of a
+//!   vehicle that has left when they differ at all.
+//! - *Kept.* Counts are pending until the region has them, which the leader detects when its own
+//!   message comes back. A broker may forward a message and still fail to store it, so the leader
+//!   checks the region once more some seconds later. Without a connection only the latest counts of
+//!   each vehicle are pending.
+//! - *Monotonic.* A leader may have fewer counts than the region, for example after losing its
+//!   disk. It therefore first reads its cell's earlier message, and then sends the larger of every
+//!   count. If the earlier message arrives late, the leader corrects its own message.
+//! - *News.* A cell's first counts of a present vehicle are due at once; further counts are
+//!   gathered for a second.
+//! - *Resets.* A leader that missed a reset of its cell's evidence adds to the region's counts only
+//!   the votes that it counts from then on.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -23,26 +32,28 @@ use crate::wire::{CellReputation, ReputationTopic};
 /// Minimum time between two messages about one vehicle.
 const SEND_PERIOD: Duration = Duration::from_secs(10);
 
-/// Time for which a leader listens for what its cell said of a vehicle before.
+/// Time for which a leader waits for its cell's earlier counts of a vehicle.
 const LISTEN_TIME: Duration = Duration::from_secs(2);
 
-/// Time after a message from which the region is asked whether it has kept it.
+/// Time after a message from which the leader checks whether the region has stored it.
 const ASK_AGAIN_AFTER: Duration = Duration::from_secs(10);
 
-/// Factor on the number of votes that is news of a present vehicle.
+/// Factor by which a present vehicle's number of votes must grow to count as news.
 const NEWS_FACTOR: f64 = 1.5;
 
-/// Difference of the share of right votes that is news of a present vehicle.
+/// Change of a present vehicle's share of right votes that counts as news.
 const NEWS_SHARE: f64 = 0.05;
 
-/// Maximum number of vehicles that have left and wait to be told of; those with the fewest votes make room.
+/// Maximum number of vehicles that have left and whose counts are pending; the vehicles with the
+/// fewest votes are dropped first.
 const MAX_WAITING: usize = 1024;
 
-/// Maximum number of filters in one subscription. All that is retained below them comes at once, and must fit into what a broker
-/// keeps for a subscriber.
+/// Maximum number of filters in one subscription. All retained messages that match arrive at once,
+/// and must fit into a broker's queue for a subscriber.
 const MAX_FILTERS: usize = 16;
 
-/// Time for which first words of cells are gathered: a vehicle that comes is told of by many at once.
+/// Time for which first counts of cells are gathered, because many cells send counts for an
+/// arriving vehicle at the same time.
 const GATHER_TIME: Duration = Duration::from_millis(20);
 
 /// Time for which further counts are gathered.
@@ -59,31 +70,31 @@ pub enum ExchangeStep {
     Publish(CellReputation),
 }
 
-/// A vehicle that is present or waits to be told of.
+/// A vehicle that is present or has pending counts.
 #[derive(Debug, Clone, Default)]
 struct KnownVehicle {
     is_present: bool,
-    /// The counts of the ledger, once they are known.
+    /// The counts of the ledger; `None` before they are set.
     own: Option<CellCounts>,
-    /// The counts that the region has of this cell: those heard last.
+    /// This cell's counts in the region, as last received.
     told: CellCounts,
-    /// The largest of every count heard after the last reset.
+    /// The largest of every count received after the last reset.
     heard: CellCounts,
     missed_reset: Option<MissedReset>,
     /// The filter on this connection, and since when.
     filter: Option<(VehicleFilter, Timestamp)>,
     has_heard: bool,
     sent_at: Option<Timestamp>,
-    /// True if what was sent is known to be kept, or was asked for once.
+    /// True if the last message is confirmed as stored, or the check was made once.
     is_kept: bool,
 }
 
-/// A reset that the region has and the ledger does not.
+/// A reset that the region has and the ledger lacks.
 #[derive(Debug, Clone, Copy)]
 struct MissedReset {
-    /// The counts of the ledger when it was heard.
+    /// The counts of the ledger when the reset was received.
     own: CellCounts,
-    /// The counts of the region then.
+    /// The counts of the region at that time.
     region: CellCounts,
 }
 
@@ -93,13 +104,13 @@ enum VehicleFilter {
     OwnCell,
 }
 
-/// A leader's part in the exchange of one cell.
+/// The exchange of one cell, on its leader.
 #[derive(Debug, Clone)]
 pub struct ReputationExchange {
     cell: NodeName,
     vehicles: BTreeMap<NodeName, KnownVehicle>,
     foreign: ForeignReputations,
-    /// When news of other cells, or another judgement of them, are due.
+    /// Time when news of other cells, or a change of their weight, is due.
     news_at: Option<Timestamp>,
     /// True if there are news of other cells.
     is_news: bool,
@@ -107,7 +118,8 @@ pub struct ReputationExchange {
 }
 
 impl KnownVehicle {
-    /// What the region is to have: no count less than it has, since the last reset.
+    /// The counts that the region should have: no count lower than in the region, since the last
+    /// reset.
     fn wanted(&self) -> CellCounts {
         let mut wanted = self.heard;
         let own = self.own.unwrap_or_default();
@@ -118,7 +130,7 @@ impl KnownVehicle {
         wanted
     }
 
-    /// Notes or forgets that the ledger lacks a reset that the region has.
+    /// Sets or clears the state that the ledger lacks a reset that the region has.
     fn compare_resets(&mut self) {
         let Some(own) = self.own else { return };
         let noted_at = self.missed_reset.map(|missed| missed.region.reset_at);
@@ -132,12 +144,12 @@ impl KnownVehicle {
         }
     }
 
-    /// True if nothing is to be heard of it or told.
+    /// True if there are no counts left to receive or send for the vehicle.
     fn is_done(&self) -> bool {
         !self.is_present && self.is_told() && (self.is_kept || self.sent_at.is_none())
     }
 
-    /// True if the region is to be asked whether it has kept what was sent.
+    /// True if it is time to check whether the region has stored the last message.
     fn is_to_be_asked(&self, now: Timestamp) -> bool {
         let is_due = self
             .sent_at
@@ -149,7 +161,7 @@ impl KnownVehicle {
         self.wanted() == self.told
     }
 
-    /// True if the counts say something that those in the region do not.
+    /// True if the counts contain news compared to those in the region.
     fn is_news(&self) -> bool {
         let (wanted, told) = (self.wanted(), self.told);
         wanted.reset_at > told.reset_at
@@ -162,7 +174,7 @@ impl KnownVehicle {
         has_paused && self.may_be_told(now) && (!self.is_present || self.is_news())
     }
 
-    /// True if the region lacks something, and it is known what it has.
+    /// True if the region lacks counts and its own state has been received.
     fn may_be_told(&self, now: Timestamp) -> bool {
         let has_listened = self
             .filter
@@ -193,7 +205,8 @@ impl VehicleFilter {
 }
 
 impl ReputationExchange {
-    /// No vehicles yet of a cell. That is news: an earlier exchange may have said more.
+    /// Creates the exchange of a cell without vehicles. The empty state counts as news, because an
+    /// earlier exchange may have had counts.
     pub fn new(cell: NodeName) -> Self {
         let news_at = Some(Timestamp::default());
         let (vehicles, foreign) = (BTreeMap::new(), ForeignReputations::default());
@@ -207,8 +220,8 @@ impl ReputationExchange {
         }
     }
 
-    /// Takes the vehicles that are present. What other cells say of the rest is forgotten. The same ones again come from an
-    /// aggregator that began anew, which is told anew.
+    /// Sets the vehicles that are present. Other cells' counts of all other vehicles are dropped.
+    /// If the set is unchanged, the aggregator has restarted and gets all counts again.
     pub fn set_present(&mut self, present: &BTreeSet<NodeName>) {
         let mut is_same = true;
         for name in present.iter().take(MAX_FOREIGN_VEHICLES) {
@@ -224,7 +237,7 @@ impl ReputationExchange {
         self.make_room();
     }
 
-    /// Takes what the ledger says of a vehicle. It may contradict other cells.
+    /// Sets the ledger's counts of a vehicle. They may contradict other cells.
     pub fn count(&mut self, vehicle: &NodeName, counts: CellCounts, now: Timestamp) {
         let known = self.vehicles.entry(vehicle.clone()).or_default();
         known.own = Some(counts);
@@ -235,7 +248,8 @@ impl ReputationExchange {
         self.make_room();
     }
 
-    /// Begins a connection: nothing is subscribed, and the broker may have lost what it had.
+    /// Starts a connection: there are no subscriptions, and the broker may have lost its retained
+    /// messages.
     pub fn connect(&mut self) {
         for vehicle in self.vehicles.values_mut() {
             let KnownVehicle {
@@ -253,14 +267,15 @@ impl ReputationExchange {
         }
     }
 
-    /// Takes a message of the region at `now`; true if it is news of another cell about a vehicle that is present.
+    /// Processes a message of the region at `now`; returns true if it contains news of another cell
+    /// about a present vehicle.
     pub fn hear(&mut self, message: &CellReputation, now: Timestamp) -> bool {
         let Some(vehicle) = self.vehicles.get_mut(&message.vehicle) else {
             return false;
         };
         let counts = CellCounts::from(message);
         if message.cell == self.cell {
-            // A broker keeps the last message, which need not be the largest.
+            // A broker keeps the last message, which is not necessarily the largest.
             vehicle.told = counts;
             vehicle.heard.merge(counts);
             vehicle.compare_resets();
@@ -288,8 +303,8 @@ impl ReputationExchange {
         self.news_at
     }
 
-    /// All that other cells say of the vehicles that are present, if there is news and it is due. Their word is judged by the
-    /// own evidence.
+    /// All other cells' counts of the present vehicles, if there is news and it is due. The counts
+    /// are weighted by comparison with this cell's own evidence.
     pub fn take_news(&mut self, now: Timestamp) -> Option<ForeignReputations> {
         self.news_at.take_if(|at| *at <= now)?;
         let vehicles = &self.vehicles;
@@ -304,7 +319,7 @@ impl ReputationExchange {
         self.news_at = Some(self.news_at.map_or(at, |news_at| news_at.min(at)));
     }
 
-    /// The next steps on a connection, with at most so many messages.
+    /// The next steps on a connection, with at most `max_messages` messages.
     pub fn next(&mut self, now: Timestamp, max_messages: usize) -> Vec<ExchangeStep> {
         let mut steps = Vec::new();
         let (mut ended, mut begun) = (Vec::new(), Vec::new());
@@ -341,14 +356,14 @@ impl ReputationExchange {
         steps
     }
 
-    /// Notes that a message was not sent: it is due again.
+    /// Records that a message was not sent; it is due again.
     pub fn not_sent(&mut self, vehicle: &NodeName) {
         if let Some(vehicle) = self.vehicles.get_mut(vehicle) {
             vehicle.sent_at = None;
         }
     }
 
-    /// All that the region does not have, for a leader that leaves.
+    /// All counts that the region lacks, for a leader that leaves.
     pub fn farewell(&self, now: Timestamp) -> Vec<CellReputation> {
         let untold = self
             .vehicles
@@ -359,7 +374,7 @@ impl ReputationExchange {
             .collect()
     }
 
-    /// Number of vehicles of which the region was not told for want of room.
+    /// Number of vehicles whose counts were dropped because too many were pending.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }

@@ -221,7 +221,7 @@ fn maps_count_in_the_order_of_epoch_and_round() {
         neighbours.accept(&east(), message, ms(at + 50))
     };
     assert_eq!(taken(1, "a", 20, 2000), Err(RejectReason::OutOfOrder));
-    // A new leader's clock is unknown, and the cell's time goes on.
+    // A new leader's clock is unknown, and the cell's time continues.
     assert_eq!(taken(2, "b", 1, 2100), Ok(()));
     assert_eq!(taken(1, "a", 99, 2200), Err(RejectReason::Superseded));
     assert_eq!(taken(2, "b", 2, 2300), Ok(()));
@@ -248,7 +248,8 @@ fn a_jump_of_the_cells_time_costs_no_map() {
     }
 }
 
-/// A minute without a link, in which the lead moves; then all that was sent meanwhile comes within two seconds.
+/// A minute without a link, in which the lead moves; then all that was sent meanwhile comes within
+/// two seconds.
 #[test]
 fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
     for knows_before in [true, false] {
@@ -295,8 +296,8 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
     }
 }
 
-/// Maps of some cells at 2 Hz for seven minutes, from the 40th second on `late_ms` later, by the cell's number. Numbers of maps
-/// of each that counted in the second minute, and in the last one.
+/// Maps of some cells at 2 Hz for seven minutes, from the 40th second on `late_ms` later, by the
+/// cell's number. Numbers of maps of each that counted in the second minute, and in the last one.
 fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
     let mut filter = CellMapFilter::new(16);
     let mut counted = [0, 1].map(|_| vec![0; cells as usize]);
@@ -308,7 +309,7 @@ fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
         |(sent, cell): (u64, u64)| sent + 20 + if sent < 40_000 { 0 } else { late_ms(cell) };
     messages.sort_by_key(|message| received(*message));
     for (sent, cell) in messages {
-        // Each clock is off by seconds of its own.
+        // Each clock has its own error of some seconds.
         let message = map(
             1,
             "a",
@@ -395,7 +396,8 @@ fn a_cell_beyond_the_bound_is_refused_until_another_is_silent() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
-    /// Whatever is delayed, doubled and overtaken: nothing old is taken, nothing twice, and no object is there twice.
+    /// With any delays, duplicates and reordering, each map is used at most once and while it is
+    /// recent, and each object appears once.
     #[test]
     fn no_order_of_messages_makes_a_map_old_or_an_object_double(
         delays in vec((0_u64..10, 0_u64..10_000, any::<bool>()), 200),
@@ -405,7 +407,7 @@ proptest! {
         let mut messages = Vec::new();
         for (number, (kind, late_ms, is_double)) in delays.into_iter().enumerate() {
             let sent = 100 * number as u64;
-            // Most take what they take at least and some jitter, and so do the first.
+            // Most messages have the least delay plus some jitter, including the first ones.
             let late_ms = if kind < 7 || sent < 1500 { late_ms % 40 } else { late_ms };
             messages.push((sent + 50 + late_ms, number, sent));
             if is_double {

@@ -1,8 +1,9 @@
 //! At most one object of a report for each place, and one place for each object.
 //!
-//! Every object prefers the place it is nearest to. Where no two prefer the same, that is the assignment. Objects that
-//! contest a place are assigned together with all that they could displace, with the greatest sum of the benefits
-//! 1 − d²/g²; d is the distance and g the gate in standard deviations. An object that gets no place is left out.
+//! Every object prefers the place it is nearest to. Where no two prefer the same, that is the
+//! assignment. Objects that contest a place are assigned together with all that they could
+//! displace, with the greatest sum of the benefits 1 − d²/g²; d is the distance and g the gate in
+//! standard deviations. An object that gets no place is left out.
 
 use hashbrown::HashSet;
 
@@ -19,14 +20,15 @@ pub(super) struct Pairing<'a> {
     pub(super) distance_squared: f64,
 }
 
-/// Objects or places in one contest, whichever are fewer, beyond which the nearest object keeps each place. Larger
-/// contests occur in fabricated reports only and would take too long to solve.
+/// Objects or places in one contest, whichever are fewer, beyond which the nearest object keeps
+/// each place. Larger contests occur in fabricated reports only and would take too long to solve.
 const MAX_CONTEST: usize = 64;
 
 /// Assigns the objects of one report to places.
 ///
-/// `wishes` has each object at its nearest place, ascending by place and distance; `pairings` lists all places that an
-/// object can take, within a gate of `gate_sigmas` standard deviations. The result is ascending by place.
+/// `wishes` has each object at its nearest place, ascending by place and distance; `pairings` lists
+/// all places that an object can take, within a gate of `gate_sigmas` standard deviations. The
+/// result is ascending by place.
 pub(super) fn one_to_one<'a, I>(
     wishes: Vec<Pairing<'a>>,
     pairings: impl Fn(&'a PerceivedObject) -> I,
@@ -44,8 +46,8 @@ where
         return wishes;
     }
     contested.dedup();
-    // Collects all that could be displaced: the objects at a contested place, the other places that these could take,
-    // the objects there, and so on. Every other object keeps its nearest place.
+    // Collects all that could be displaced: the objects at a contested place, the other places that
+    // these could take, the objects there, and so on. Every other object keeps its nearest place.
     let mut reached: HashSet<Place> = contested.iter().copied().collect();
     let mut contestants = Vec::new();
     let mut objects = 0;

@@ -1,20 +1,25 @@
 //! PACE with evidence of presence and of absence.
 //!
-//! Each vehicle has the log-odds of each label at each landmark that it had in view lately, as in an occupancy grid
-//! (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, chapter 9.2). Unlike there, a cell has one value per label:
+//! Each vehicle has the log-odds of each label at each landmark that it had in view recently, as in
+//! an occupancy grid (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, chapter 9.2). Unlike
+//! there, a cell has one value per label:
 //!
-//! - A frame that shows label l with confidence c adds c·ln(p_d/p_f) to l and subtracts as much from the other labels.
-//! - A frame without a detection in a landmark that is in view subtracts ln((1−p_f)/(1−p_d)) from all labels. In view is what
-//!   the report lists as `seen`; in a report without a list, what lies in the field of view that it states.
-//! - One vehicle's evidence is bounded, so that a fast or stubborn vehicle does not outvote the others.
+//! - A frame that shows label l with confidence c adds c·ln(p_d/p_f) to l and subtracts as much
+//!   from the other labels.
+//! - A frame without a detection at a landmark in view subtracts ln((1−p_f)/(1−p_d)) from all
+//!   labels. A landmark is in view if the report lists it as `seen` or, in a report without a list,
+//!   if it lies in the stated field of view.
+//! - One vehicle's evidence is bounded, so that a fast or stubborn vehicle does not outvote the
+//!   others.
 //!
-//! A round adds the vehicles' log-odds: S(ρ,l) = Σ_v L_v(ρ,l), label = argmax S, confidence = e^S(l) / (1 + Σ e^S). This
-//! is the posterior if labels and "nothing" exclude each other and have equal priors. The position is the mean of the
-//! vehicles' last positions weighted by their inverse covariances.
+//! A round adds the vehicles' log-odds: S(ρ,l) = Σ_v L_v(ρ,l), label = argmax S, confidence =
+//! e^S(l) / (1 + Σ e^S). This is the posterior if the labels and the empty state exclude each other
+//! and have equal priors. The position is the mean of the vehicles' last positions weighted by
+//! their inverse covariances.
 //!
-//! A vacancy sign is a second place with its own log-odds. Any object outweighs it, because a sign behind an object can
-//! still be seen from the side. A landmark is known to be empty where vehicles looked and found nothing: it then takes
-//! the label of its vacancy sign, or null without one.
+//! A vacancy sign is a second place with its own log-odds. Any object outweighs it, because a sign
+//! behind an object can still be seen from the side. A landmark counts as empty if vehicles had it
+//! in view without a detection: it then gets the label of its vacancy sign, or null without a sign.
 
 mod belief;
 mod consensus;
@@ -88,7 +93,7 @@ impl BayesPace {
             .resize(self.landmarks.landmarks().len(), None);
     }
 
-    /// The known locations, and how near an object must be to one.
+    /// The landmarks, and the gate between an object and a landmark.
     pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
         (&self.landmarks, self.config.gate_m)
     }
@@ -135,7 +140,8 @@ impl BayesPace {
         }
     }
 
-    /// Every place that the vehicle had in view, ascending: those with a detection and those listed as `seen`.
+    /// Every place that the vehicle had in view, ascending: places with a detection and places
+    /// listed as `seen`.
     fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
         let mut observations = self.associate(&report.objects);
         let looked_at = |landmark| Observation {
@@ -176,7 +182,8 @@ impl BayesPace {
         })
     }
 
-    /// The objects at their nearest places, with `one_to_one` settled so that they share none; ascending by place.
+    /// The objects at their nearest places, ascending by place. With `one_to_one`, conflicts are
+    /// resolved so that objects don't share a place.
     fn associate<'a>(&self, objects: &'a [PerceivedObject]) -> Vec<Observation<'a>> {
         let gate = self.config.gate();
         let pairing = |object, candidate: LandmarkCandidate| Pairing {
@@ -238,7 +245,8 @@ impl BayesPace {
         self.without_label(landmark, &beliefs)
     }
 
-    /// The label with the most evidence at one place, if there is any; `observers` had the landmark in view.
+    /// The label with the most evidence at one place, if there is any; `observers` had the landmark
+    /// in view.
     fn agree_on_label(
         &self,
         landmark: &Landmark,
@@ -271,7 +279,7 @@ impl BayesPace {
         })
     }
 
-    /// The state of a landmark that is known to be empty or was not in view.
+    /// The state of a landmark that counts as empty or was not in view.
     fn without_label(&self, landmark: &Landmark, beliefs: &[NamedBelief<'_>]) -> LandmarkState {
         let absence: f64 = -beliefs
             .iter()

@@ -15,7 +15,8 @@ impl Place {
     }
 }
 
-/// The present number of each place that belongs to a landmark which is still there, of `per_landmark` places each.
+/// The present number of each place that belongs to a landmark which is still there, of
+/// `per_landmark` places each.
 pub(super) fn places_after(
     before: Arc<LandmarkIndex>,
     after: Arc<LandmarkIndex>,
@@ -28,7 +29,8 @@ pub(super) fn places_after(
     }
 }
 
-/// The items of one vehicle and the place of each. Places are apart from items, so that regrouping reads nothing else.
+/// The items of one vehicle and the place of each. Places are stored separately from items, so that
+/// regrouping reads only the places.
 #[derive(Debug, Clone)]
 pub(super) struct VehicleItems<'a, T> {
     pub(super) node: NodeName,
@@ -36,7 +38,8 @@ pub(super) struct VehicleItems<'a, T> {
     pub(super) items: &'a [T],
 }
 
-/// Buffers of a counting sort by place, kept from round to round; its time is linear in items and places.
+/// Buffers of a counting sort by place, kept from round to round; its time is linear in items and
+/// places.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Grouping {
     /// (vehicle, item) by place.
@@ -52,7 +55,8 @@ pub(super) struct ByPlace<'a, T> {
 }
 
 impl Grouping {
-    /// Groups the vehicles' items for `places` places, keeping the order of vehicles and of their items within a place.
+    /// Groups the vehicles' items for `places` places, keeping the order of vehicles and of their
+    /// items within a place.
     pub(super) fn group<'a, T>(
         &'a mut self,
         vehicles: &'a [VehicleItems<'a, T>],

@@ -1,8 +1,9 @@
 //! PACE as the paper prints it (Algorithm 2).
 //!
-//! For each location ρ, O_ρ holds every object of the vehicles' latest reports within δ of ρ. The label has the largest
-//! sum of confidences, the confidence is Σc²/Σc over O_ρ, and the position is the mean. An object within δ of two
-//! locations counts at both. Vacancy signs, covariances, `seen` and the order of frames are not used.
+//! For each location ρ, O_ρ holds every object of the vehicles' latest reports within δ of ρ. The
+//! label has the largest sum of confidences, the confidence is Σc²/Σc over O_ρ, and the position is
+//! the mean. An object within δ of two locations counts at both. Vacancy signs, covariances, `seen`
+//! and the order of frames are not used.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -28,7 +29,7 @@ pub struct PaperPace {
     grouping: Grouping,
 }
 
-/// A vehicle's latest report: its objects near known locations, once for each location.
+/// A vehicle's latest report: its objects near landmarks, once for each landmark.
 #[derive(Debug, Clone, Default)]
 struct LatestDetections {
     captured_at: Timestamp,
@@ -77,7 +78,7 @@ impl PaperPace {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
     }
 
-    /// The known locations and the gate in metres.
+    /// The landmarks and the gate in metres.
     pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
         (&self.landmarks, self.gate_m)
     }

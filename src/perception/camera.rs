@@ -1,8 +1,9 @@
 //! The pinhole camera: intrinsics and the mount on the vehicle.
 //!
-//! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper left corner of the
-//! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are
-//! undistorted. Level frame: the camera as origin, forward along the heading of its axis, left, up, metres.
+//! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper
+//! left corner of the image, x to the right, y downwards. Lens distortion is removed where images
+//! are handled; pixels here are undistorted. Level frame: the camera as origin, forward along the
+//! heading of its axis, left, up, metres.
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
@@ -27,7 +28,8 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// A camera without distortion whose axis goes through the middle of the image: f = (w/2) / tan(fov/2).
+    /// A camera without distortion whose axis goes through the middle of the image: f = (w/2) /
+    /// tan(fov/2).
     pub fn from_field_of_view(
         width: u32,
         height: u32,
@@ -45,7 +47,8 @@ impl Intrinsics {
         }
     }
 
-    /// A camera of square pixels without distortion whose axis goes through the middle of the image.
+    /// A camera of square pixels without distortion whose axis goes through the middle of the
+    /// image.
     pub fn with_square_pixels(width: u32, height: u32, horizontal_rad: f64) -> Self {
         let camera = Self::from_field_of_view(width, height, horizontal_rad, horizontal_rad);
         Self {
@@ -59,7 +62,8 @@ impl Intrinsics {
         ((self.cx - x_px) / self.fx).atan()
     }
 
-    /// The paper's γ: the angle of a column in radians, with the field of view spread evenly over the image.
+    /// The paper's γ: the angle of a column in radians, with the field of view spread evenly over
+    /// the image.
     pub fn angle_per_pixel(&self) -> f64 {
         self.horizontal_field_of_view() / f64::from(self.width)
     }
@@ -91,8 +95,8 @@ impl Intrinsics {
 
 /// The mount of the camera on its vehicle, which stands on level ground.
 ///
-/// Angles are right-handed about the forward, left and up axes of the vehicle (ISO 8855, ROS REP 103), and turn in the
-/// order pan, pitch, roll.
+/// Angles are right-handed about the forward, left and up axes of the vehicle (ISO 8855, ROS REP
+/// 103), and turn in the order pan, pitch, roll.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Mount {
     /// Metres ahead of the vehicle's reference point.
@@ -101,7 +105,7 @@ pub struct Mount {
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in radians, counter-clockwise.
     pub pan_rad: f64,
-    /// Height above the ground in metres, if it is known.
+    /// Height above the ground in metres, if available.
     pub height_m: Option<f64>,
     /// Angle of the axis below the horizon in radians.
     pub pitch_rad: f64,
@@ -118,8 +122,8 @@ impl Mount {
         }
     }
 
-    /// The pose of the camera as reports state it, with what is known of its height and tilt. Without a height, an axis
-    /// that is level in the configuration says nothing.
+    /// The pose of the camera as reports state it, including its height and tilt if configured. A
+    /// level axis without a configured height is the default and is not stated.
     pub fn stated_pose(&self, camera: &Pose) -> WirePose {
         let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
         let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));
@@ -136,8 +140,9 @@ impl Mount {
         self.pitch_rad != 0.0 || self.roll_rad != 0.0
     }
 
-    /// Distances in metres of the ground at the lower and the upper edge of the image's middle column; the upper one is
-    /// infinite at the horizon. `None` without a height, or without ground in view.
+    /// Distances in metres of the ground at the lower and the upper edge of the image's middle
+    /// column; the upper one is infinite at the horizon. `None` without a height, or without ground
+    /// in view.
     pub fn ground_in_view(&self, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
         let distance_m = |row_px: f64| {
             let ground = self.ground_at(&Point2::new(intrinsics.cx, row_px), intrinsics);
@@ -147,8 +152,8 @@ impl Mount {
         near_m.is_finite().then_some([near_m, far_m])
     }
 
-    /// Metres ahead and to the left of the camera at which a pixel shows the ground; `None` without a height, and from the
-    /// horizon on.
+    /// Metres ahead and to the left of the camera at which a pixel shows the ground; `None` without
+    /// a height, and from the horizon on.
     pub fn ground_at(&self, pixel: &Point2<f64>, intrinsics: &Intrinsics) -> Option<Vector2<f64>> {
         let ray = self.to_level() * intrinsics.ray(pixel);
         let distance = self.height_m? / -ray.z;

@@ -1,4 +1,4 @@
-//! Known locations: the set R of the paper.
+//! Landmarks: the set R of the paper.
 
 mod config;
 mod grid;
@@ -12,7 +12,7 @@ pub use index::{LandmarkCandidate, LandmarkGate, LandmarkIndex};
 
 use crate::model::names::{Label, LandmarkId};
 
-/// A known location at which an object may stand.
+/// A location, given in the configuration, at which an object may stand.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Landmark {
     /// The location's name.
@@ -37,7 +37,8 @@ impl Landmark {
     }
 }
 
-/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object in front outweighs it.
+/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object in front outweighs
+/// it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VacancySign {
     /// The text of the sign.

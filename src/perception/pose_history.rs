@@ -17,7 +17,8 @@ const MAX_POSES: usize = 512;
 
 /// A vehicle's latest poses, by the clock that stamps its frames.
 ///
-/// Between two poses it interpolates linearly and turns the shorter way; shortly after the newest it extrapolates.
+/// Between two poses it interpolates linearly and turns the shorter way; shortly after the newest
+/// it extrapolates.
 #[derive(Debug, Clone, Default)]
 pub struct PoseHistory {
     poses: VecDeque<(Timestamp, Pose)>,
@@ -36,7 +37,7 @@ impl PoseHistory {
         is_later
     }
 
-    /// The pose at a time; `None` if no pose is known near it.
+    /// The pose at a time; `None` if there is no pose near that time.
     pub fn at(&self, time: Timestamp) -> Option<Pose> {
         let after = self.poses.partition_point(|(at, _)| *at < time);
         let Some((next_at, next)) = self.poses.get(after) else {

@@ -4,8 +4,9 @@
 //! Detection --ranging--> forward, left of the camera --Pose--> PerceivedObject (east, north, covariance)
 //! ```
 //!
-//! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but [`Ranging::Paper`] are exact for a
-//! pinhole camera, under the assumptions about the object that it states.
+//! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but
+//! [`Ranging::Paper`] are exact for a pinhole camera, under the assumptions about the object that
+//! it states.
 
 mod auto;
 mod box_height;
@@ -37,7 +38,7 @@ use crate::wire::PerceivedObject;
 /// The reason why a detection has no position.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ProjectionError {
-    /// Neither a size for the label nor a default size is configured.
+    /// The configuration has no size for the label and no default size.
     #[error(
         "no known size for label {0:?} and no default size: set camera.projection.sizes, or camera.mount.height_m to \
          range it by the ground"
@@ -113,8 +114,8 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// The edges of the image that cut a box in the raw image, before distortion is removed. The corners of a target show
-    /// the whole of it.
+    /// The edges of the image that cut a box in the raw image, before distortion is removed. The
+    /// corners of a target show the whole of it.
     pub fn cut(&self, detection: &Detection) -> Cut {
         if detection.corners.is_some() && self.config.ranging.uses_corners() {
             return Cut::default();
@@ -131,13 +132,14 @@ impl Projection {
         }
     }
 
-    /// Places a detection from `camera` whose distortion has been removed; for `cut` see [`Self::cut`].
+    /// Places a detection from `camera` whose distortion has been removed; for `cut` see
+    /// [`Self::cut`].
     ///
-    /// `target` is the middle of the detection's solved corners in the camera frame, in metres; only [`Ranging::Auto`] and
-    /// [`Ranging::Corners`] use it.
+    /// `target` is the middle of the detection's solved corners in the camera frame, in metres;
+    /// only [`Ranging::Auto`] and [`Ranging::Corners`] use it.
     ///
     /// # Errors
-    /// [`ProjectionError`] if the detection gives no position.
+    /// Returns a [`ProjectionError`] if the detection gives no position.
     pub fn place(
         &self,
         detection: &Detection,
@@ -214,8 +216,8 @@ impl Projection {
         }
     }
 
-    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged by an extent in the
-    /// image.
+    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged
+    /// by an extent in the image.
     fn line_of_sight(
         &self,
         forward_m: f64,
@@ -231,8 +233,9 @@ impl Projection {
         )
     }
 
-    /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d is the root of the sum
-    /// of both squared relative errors, and both edges of the extent have pixel noise.
+    /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d
+    /// is the root of the sum of both squared relative errors, and both edges of the extent have
+    /// pixel noise.
     fn sized(
         &self,
         bearing_rad: f64,
@@ -251,8 +254,8 @@ impl Projection {
         }
     }
 
-    /// First-order error propagation along and across the line of sight. The heading's error turns it; the errors of the
-    /// camera's position and the floor add to both.
+    /// First-order error propagation along and across the line of sight. The heading's error turns
+    /// it; the errors of the camera's position and the floor add to both.
     fn covariance(&self, sight: &LineOfSight, direction_rad: f64) -> Covariance {
         let ProjectionConfig {
             heading_sigma_rad,
@@ -282,7 +285,7 @@ struct LineOfSight {
     distance_m: f64,
     /// Standard deviation of the distance.
     along_m: f64,
-    /// Standard deviation of the bearing, without that of the heading.
+    /// Standard deviation of the bearing, excluding the error of the heading.
     turn_rad: f64,
 }
 

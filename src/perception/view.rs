@@ -1,8 +1,10 @@
-//! The known locations in view of a camera: near enough to be read, inside the image, not turned away, not hidden. A
-//! camera whose height is known has the rows of the image judged by the ground, others by the columns alone.
+//! The landmarks in view of a camera: near enough to be read, inside the image, not turned away,
+//! not hidden. If the camera's height is configured, image rows are checked by the ground;
+//! otherwise only columns are checked.
 //!
-//! A report lists them as `seen`, so that a location in view without a detection is known to be empty. A false claim does
-//! more harm than a missing one: a location must meet every condition.
+//! A report lists these landmarks as `seen`, so that a landmark in view without a detection counts
+//! as empty. A false claim does more harm than a missing one, so a landmark must meet every
+//! condition.
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2};
 
@@ -17,28 +19,31 @@ use crate::wire::PerceivedObject;
 config_section! {
     /// Conditions for a location to be in view.
     pub struct ViewConfig {
-        /// Width of the target or object to be recognised at a location, in metres; default that of the smallest listed
-        /// size or, without any, 0.05.
+        /// Width of the target or object to be recognised at a location, in metres; by default the
+        /// smallest configured size or, without any, 0.05.
         pub target_width_m: Option<f64> = None, checked by check_optional(1e-4, 1e3);
-        /// Minimum width in pixels of the target as it is turned; default 36: a placard code of 21 modules at 1.7 pixels
-        /// each. Less claims more locations, some of which the detector cannot read.
+        /// Minimum width in pixels of the target at its actual angle; default 36: a placard code of
+        /// 21 modules at 1.7 pixels each. A lower value claims more locations, some of which the
+        /// detector cannot read.
         pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
-        /// Minimum distance in pixels of the target from the left and right edges of the image; default 8.
+        /// Minimum distance in pixels of the target from the left and right edges of the image;
+        /// default 8.
         pub margin_px: f64 = 8.0, in 0.0 to 1e5;
         /// Maximum distance of a location in metres; default 20.
         pub max_range_m: f64 = 20.0, in 1e-3 to 1e6;
-        /// Maximum angle in radians between the facing of the location and the direction to the camera; default 0.87
-        /// (50°).
+        /// Maximum angle in radians between the facing of the location and the direction to the
+        /// camera; default 0.87 (50°).
         pub max_yaw_rad: f64 = 0.87, in 0.0 to std::f64::consts::PI;
-        /// Width in metres of an occluding object whose label has no listed size; default the target's, at least 0.07.
+        /// Width in metres of an occluding object whose label has no listed size; default the
+        /// target's, at least 0.07.
         pub occluder_width_m: Option<f64> = None, checked by check_optional(0.0, 1e3);
-        /// Distance in metres by which an object must be nearer than a location to hide it; default 0.05. It must exceed
-        /// the error of a position, or an object hides its own location.
+        /// Distance in metres by which an object must be nearer than a location to hide it; default
+        /// 0.05. It must exceed the error of a position, or an object hides its own location.
         pub clearance_m: f64 = 0.05, in 0.0 to 1e3;
     }
 }
 
-/// Widths of target and occluder of placards, where nothing is known.
+/// Widths of target and occluder of placards, used without configured sizes.
 const PLACARD_TARGET_M: f64 = 0.05;
 const PLACARD_OCCLUDER_M: f64 = 0.07;
 
@@ -93,7 +98,8 @@ impl PosedCamera {
         }
     }
 
-    /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
+    /// The pixel of a point on the ground or, if the camera's height is not configured, at the
+    /// camera's height; `None` behind the camera.
     pub fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
         let level = self
             .pose
@@ -104,8 +110,8 @@ impl PosedCamera {
     }
 }
 
-/// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind them, with the widths
-/// in `sizes` for listed labels.
+/// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind
+/// them, with the widths in `sizes` for listed labels.
 pub fn landmarks_in_view(
     landmarks: &[Landmark],
     camera: &PosedCamera,
@@ -210,8 +216,8 @@ impl Occluder {
         }
     }
 
-    /// True if any part of a target at the given range and bearing is behind this object; `width_share` is the visible
-    /// share of its width.
+    /// True if any part of a target at the given range and bearing is behind this object;
+    /// `width_share` is the visible share of its width.
     fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, widths: &Widths) -> bool {
         self.range_m + widths.config.clearance_m < range_m
             && wrap_angle(self.bearing_rad - bearing_rad).abs()
@@ -219,7 +225,7 @@ impl Occluder {
     }
 }
 
-/// The visible share of a flat target's width, 0 to 1; 1 if its facing is not known.
+/// The visible share of a flat target's width, 0 to 1; 1 if it has no facing.
 fn visible_width_share(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
     let to_camera = camera.position - position;
     facing_rad.map_or(1.0, |facing_rad| {

@@ -1,4 +1,5 @@
-//! The virtual time of a replay, that of the newest plausible line, and the unit of a recording's times.
+//! The virtual time of a replay, which is the time of the newest plausible line, and the unit of a
+//! recording's times.
 
 use std::fmt;
 use std::time::Duration;
@@ -8,7 +9,7 @@ use crate::model::time::Timestamp;
 /// Maximum gap before the last line of a recording.
 const LAST_STEP: Duration = Duration::from_secs(3600);
 
-/// A clock that moves forward with the lines, never back.
+/// A clock that moves forward with the lines and does not go back.
 #[derive(Debug, Clone)]
 pub(super) struct VirtualClock {
     now: Option<Timestamp>,
@@ -29,7 +30,8 @@ impl VirtualClock {
         self.now.unwrap_or_default()
     }
 
-    /// True if a line is ahead of the present, or of most lines that follow, by at most the tolerance.
+    /// True if a line is ahead of the present, or of most lines that follow, by at most the
+    /// tolerance.
     pub(super) fn is_plausible(
         &self,
         at: Timestamp,
@@ -72,8 +74,8 @@ pub enum TimeUnit {
 const RECORDED_S: std::ops::Range<u64> = 1_000_000_000..4_000_000_000;
 
 impl TimeUnit {
-    /// The unit in which a recording's first time is a date, if it is none in microseconds. Times that count from the
-    /// beginning of a recording are none in any unit.
+    /// The unit in which a recording's first time is a date; `None` if it is a date in
+    /// microseconds. A time relative to the beginning of a recording is not a date in any unit.
     pub fn of(first: Timestamp) -> Option<Self> {
         let units = [
             (Self::Seconds, 1),

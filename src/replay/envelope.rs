@@ -1,10 +1,10 @@
-//! The fields of a recorded line beside its report.
+//! The fields of a recorded line that are not part of its report.
 
 use serde::Deserialize;
 
 use crate::model::time::Timestamp;
 
-/// The optional fields of a line beside its report.
+/// The optional fields of a line that are not part of its report.
 #[derive(Debug, Deserialize)]
 pub(super) struct Envelope {
     #[serde(default)]

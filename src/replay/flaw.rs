@@ -1,4 +1,4 @@
-//! Faults of a line of a recording, in words.
+//! Faults of a line of a recording, as text.
 
 use super::envelope::Envelope;
 use crate::wire::flaw::read_json;
@@ -22,7 +22,8 @@ pub(super) fn of_line(text: &[u8], reason: RejectReason, limits: &Limits) -> Fla
     Flaw::of_json(text, reason, limits).unwrap_or_else(of_envelope)
 }
 
-/// The flaw of a line whose time, that of its receipt or else of its capture, no later line bears out.
+/// The flaw of a line whose time (of receipt or else of capture) is not confirmed by any later
+/// line.
 pub(super) fn of_time_ahead(is_of_receipt: bool) -> Flaw {
     let field = if is_of_receipt {
         "received_at_us"

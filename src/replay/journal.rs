@@ -1,9 +1,11 @@
-//! The journal of an aggregator: its inputs and their times, from which a replay gives bit-equal rounds.
+//! The journal of an aggregator: its inputs and their times, from which a replay gives bit-equal
+//! rounds.
 //!
-//! Call [`JournalReplay::entry`] and [`JournalReplay::report`] in the recorded order; they return the aggregator's maps
-//! and verdicts. Rounds are equal from a [`JournalEvent::Start`] on, with the same configuration and version. After
-//! [`JournalEvent::Continue`] or [`JournalEvent::Missing`] they may rest on less evidence. Call
-//! [`JournalReplay::restart`] where the journal of another run of the node follows.
+//! Call [`JournalReplay::entry`] and [`JournalReplay::report`] in the recorded order; they return
+//! the aggregator's maps and verdicts. Rounds are equal from a [`JournalEvent::Start`] on, with the
+//! same configuration and version. After [`JournalEvent::Continue`] or [`JournalEvent::Missing`]
+//! they may be based on less evidence. Call [`JournalReplay::restart`] where the journal of another
+//! run of the node follows.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,7 +22,7 @@ use crate::perception::landmark::Landmark;
 use crate::reputation::ReputationLedger;
 use crate::wire::{ObjectReport, RejectReason, ReportKind};
 
-/// One entry of a journal. Reports are kept beside it.
+/// One entry of a journal. Reports are stored separately.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct JournalEntry {
     /// The time that the aggregator was given as the present.
@@ -29,7 +31,7 @@ pub struct JournalEntry {
     pub event: JournalEvent,
 }
 
-/// An input of an aggregator beside reports.
+/// An input of an aggregator other than a report.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JournalEvent {
@@ -60,7 +62,8 @@ pub enum JournalEvent {
 pub struct JournalSummary {
     /// Reports in it.
     pub reports: u64,
-    /// Rejected reports by reason; many where a live aggregator gets the same report over two links.
+    /// Rejected reports by reason; many where a live aggregator gets the same report over two
+    /// links.
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Entries and reports that were lost.
     pub missing: u64,

@@ -77,7 +77,8 @@ impl RecordedReport {
     }
 }
 
-/// A line of votes by name, with zeros for the positions that its objects do not have; `None` for other lines.
+/// A line of votes by name, with zeros for the positions that its objects do not have; `None` for
+/// other lines.
 fn votes_by_name(text: &[u8]) -> Option<Vec<u8>> {
     let mut line: Value = serde_json::from_slice(text).ok()?;
     if !line
@@ -107,8 +108,8 @@ fn votes_by_name(text: &[u8]) -> Option<Vec<u8>> {
     is_by_name.then(|| line.to_string().into_bytes())
 }
 
-/// The kind of a `topic` field: `detections` or `vote_detections`, or a whole MQTT topic that ends with it and the node's
-/// name.
+/// The kind of a `topic` field: `detections` or `vote_detections`, or a whole MQTT topic that ends
+/// with it and the node's name.
 fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, Flaw> {
     let mut levels = topic.rsplit('/');
     let last = levels.next().unwrap_or_default();

@@ -458,8 +458,8 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
     (landmarks.collect(), reports)
 }
 
-/// Output of a live node until the round of the last report: reports as they come, timers at their deadlines. It closes its
-/// first round when all reports of the first time have come.
+/// Output of a live node until the round of the last report: reports as they come, timers at their
+/// deadlines. It closes its first round when all reports of the first time have come.
 fn live(
     config: &ReplayConfig,
     reports: &[(ReportKind, ObjectReport, Timestamp)],
@@ -714,7 +714,7 @@ fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_sta
     for (index, (kind, report, at)) in reports.iter().enumerate() {
         let (report, at) = (Arc::new(report.clone()), *at);
         if index == reports.len() * 3 / 4 {
-            // The aggregator is started anew, under the settings that hold by then.
+            // The aggregator is restarted under the settings valid at that time.
             live = Aggregator::new_standby(changed.clone(), known(&after), at);
             journal.entry(&begin(at));
         }

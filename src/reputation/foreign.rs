@@ -1,11 +1,13 @@
 //! Counts of other cells about vehicles, and their weight here.
 //!
-//! Each cell states absolute counts, which only grow until it is reset. Merging keeps the later reset, and the larger of every
-//! count after one reset: a join as that of the ledger, so that messages may come late, twice, or in any order. Of the
-//! counts those weigh that the cell still remembers.
+//! Each cell states absolute counts, which only grow until it is reset. Merging keeps the later
+//! reset, and the larger of every count after one reset: a join like the ledger's, so that messages
+//! may arrive late, twice, or in any order. Only the counts that the cell still keeps have weight.
 //!
-//! Here they are votes beside those of the prior (Jøsang & Ismail 2002, section 3: discounting), few enough that
-//! - one cell alone moves no vehicle further than half of the prior's weight, so that it cannot ban a newcomer;
+//! Here they are votes in addition to the prior (Jøsang & Ismail 2002, section 3: discounting), few
+//! enough that
+//! - one cell alone moves a vehicle by at most half of the prior's weight, so that it cannot ban a
+//!   newcomer;
 //! - all cells together weigh at most twice the prior, so that own evidence soon outweighs them.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,29 +19,33 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{CellReputation, ForeignVotes, SCHEMA_VERSION};
 
-/// Weight of a vote of another cell against an own one.
+/// Weight of another cell's vote relative to an own vote.
 const DISCOUNT: f64 = 0.2;
 
-/// Maximum weight of one cell's votes about a vehicle, as a share of the prior's. With a half, the worst word of one cell
-/// leaves a newcomer two thirds of its score, which is above what tracking takes for worthless.
+/// Maximum weight of one cell's votes about a vehicle, as a share of the prior's weight. With a
+/// half, the worst counts of one cell leave a newcomer two thirds of its score, which is above the
+/// score that tracking treats as worthless.
 const MAX_SHARE_EACH: f64 = 0.5;
 
-/// Maximum weight of all cells' votes about a vehicle, as a multiple of the prior's.
+/// Maximum weight of all cells' votes about a vehicle, as a multiple of the prior's weight.
 const MAX_SHARE: f64 = 2.0;
 
-/// Minimum number of remembered own votes about a vehicle by which other cells' word about it is judged.
+/// Minimum number of kept own votes about a vehicle for checking other cells' counts of that
+/// vehicle.
 const MIN_OWN_VOTES: u64 = 20;
 
-/// Minimum number of remembered votes of another cell about a vehicle from which its word is judged.
+/// Minimum number of kept votes of another cell about a vehicle for checking that cell's counts.
 const MIN_JUDGED_VOTES: u64 = 5;
 
-/// Difference of the shares of right votes from which two cells contradict each other about a vehicle.
+/// Difference of the shares of right votes from which two cells contradict each other about a
+/// vehicle.
 const CONTRADICTION: f64 = 0.35;
 
-/// Least trust in a cell's word. Vehicles that lie in one cell and not in another make the first one's word look wrong.
+/// Minimum trust in a cell's counts. Vehicles that report falsely in one cell only make that cell's
+/// counts look wrong.
 const MIN_WORD_TRUST: f64 = 0.5;
 
-/// Maximum number of cells about one vehicle; those with most votes count.
+/// Maximum number of cells about one vehicle; the cells with most votes are kept.
 const MAX_CELLS_EACH: usize = 16;
 
 /// Maximum number of vehicles.
@@ -49,18 +55,18 @@ pub const MAX_FOREIGN_VEHICLES: usize = 1024;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellCounts {
-    /// Time of the last reset of the cell's evidence; 0 if there was none.
+    /// Time of the last reset of the cell's evidence; 0 without a reset.
     #[serde(default)]
     pub reset_at: Timestamp,
     /// All votes since.
     pub all: Counts,
-    /// Those of them that the cell does not remember any more.
+    /// Votes that the cell has already dropped.
     #[serde(default)]
     pub old: Counts,
 }
 
 impl CellCounts {
-    /// Takes over what is later or larger; true if that changed anything.
+    /// Takes over values that are later or larger; returns true if that changed any.
     pub fn merge(&mut self, other: Self) -> bool {
         let before = *self;
         if other.reset_at > self.reset_at {
@@ -72,12 +78,13 @@ impl CellCounts {
         *self != before
     }
 
-    /// The votes that the cell remembers.
+    /// The votes that the cell still keeps.
     pub fn remembered(&self) -> Counts {
         self.all.minus(self.old)
     }
 
-    /// The votes that came after `before`, an earlier state of the same counts. The oldest votes are forgotten first.
+    /// The votes after `before`, an earlier state of the same counts. The oldest votes are dropped
+    /// first.
     pub fn since(&self, before: Self) -> Self {
         Self {
             all: self.all.minus(before.all),
@@ -127,18 +134,19 @@ impl From<&CellReputation> for CellCounts {
     }
 }
 
-/// Counts of other cells, and what their word is worth.
+/// Counts of other cells, and the trust in these cells.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ForeignReputations {
     /// By vehicle and cell.
     counts: BTreeMap<NodeName, BTreeMap<NodeName, CellCounts>>,
-    /// Trust, 0 to 1, in the word of the cells that own evidence contradicts.
+    /// Trust, 0 to 1, in cells whose counts this cell's own evidence contradicts.
     word_trust: BTreeMap<NodeName, f64>,
 }
 
 impl ForeignReputations {
-    /// Merges what a cell says of a vehicle; true if that changed anything. What is beyond the maxima is left out.
+    /// Merges a cell's counts about a vehicle; returns true if that changed the state. Counts
+    /// beyond the maxima are left out.
     pub fn merge(&mut self, cell: &NodeName, vehicle: &NodeName, counts: CellCounts) -> bool {
         if self.counts.len() >= MAX_FOREIGN_VEHICLES && !self.counts.contains_key(vehicle) {
             return false;
@@ -158,27 +166,28 @@ impl ForeignReputations {
         is_news
     }
 
-    /// Forgets vehicles that are not wanted; true if there were any.
+    /// Removes vehicles for which `is_wanted` is false; returns true if there were any.
     pub fn retain(&mut self, mut is_wanted: impl FnMut(&NodeName) -> bool) -> bool {
         let before = self.counts.len();
         self.counts.retain(|vehicle, _| is_wanted(vehicle));
         self.counts.len() < before
     }
 
-    /// True if a cell says something of a vehicle.
+    /// True if a cell has counts about a vehicle.
     pub fn has(&self, cell: &NodeName, vehicle: &NodeName) -> bool {
         self.counts
             .get(vehicle)
             .is_some_and(|cells| cells.contains_key(cell))
     }
 
-    /// The cells that say something.
+    /// The cells with counts.
     pub fn cells(&self) -> BTreeSet<&NodeName> {
         self.counts.values().flat_map(BTreeMap::keys).collect()
     }
 
-    /// Judges every cell's word by the own remembered votes about the same vehicles; true if that changes any weight. One
-    /// contradiction among n judged vehicles takes 1/(n + 2) of it; a half stays.
+    /// Compares every cell's counts with the own kept votes about the same vehicles; returns true
+    /// if that changes any weight. One contradiction among n compared vehicles reduces the trust by
+    /// 1/(n + 2); at least a half remains.
     pub fn judge(&mut self, own: impl Fn(&NodeName) -> Option<Counts>) -> bool {
         let mut judged = BTreeMap::<&NodeName, [f64; 2]>::new();
         for (vehicle, cells) in &self.counts {
@@ -208,7 +217,8 @@ impl ForeignReputations {
         is_news
     }
 
-    /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell's map is 0 to 1.
+    /// Every vehicle's votes in addition to a prior of this weight in votes; `trust` in each cell's
+    /// map is 0 to 1.
     pub fn votes(
         &self,
         prior_votes: f64,

@@ -1,4 +1,5 @@
-//! The ledger: settled votes by epoch, vehicle and label, and the reputations that follow from them.
+//! The ledger: settled votes by epoch, vehicle and label, and the reputations that follow from
+//! them.
 
 use std::collections::BTreeMap;
 
@@ -23,9 +24,9 @@ pub struct ReputationLedger {
     pub(super) sizes: BTreeMap<NodeName, usize>,
     /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
-    /// Signed shares on trial, by lane, and when the trial ends.
+    /// Signed shares on probation, by lane, and when the probation ends.
     pub(super) on_trial: BTreeMap<Epoch, (Statements, Timestamp)>,
-    /// Time of the last reset, in cells without certificates; 0 if there was none.
+    /// Time of the last reset, in cells without certificates; 0 without a reset.
     pub(super) reset_at: Timestamp,
 }
 
@@ -97,13 +98,14 @@ impl ReputationLedger {
         }
     }
 
-    /// Time of the last reset; 0 if there was none.
+    /// Time of the last reset; 0 without a reset.
     pub fn reset_at(&self) -> Timestamp {
         self.reset_at
     }
 
-    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Other lanes give
-    /// way to it, see [`Self::merge_entries`]. The vote is not counted where its lane alone takes all the room.
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write this
+    /// lane. Other lanes are removed to make room, see [`Self::merge_entries`]. The vote is not
+    /// counted if its lane alone takes all the room.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
         let lane = Epoch::new(epoch, aggregator.clone());
         let Some(record) =
@@ -121,7 +123,7 @@ impl ReputationLedger {
         self.reach_mark(&lane, &evidence.node, sum);
     }
 
-    /// Takes in all evidence of `other`, within the same bounds.
+    /// Merges all evidence of `other`, within the same bounds.
     pub fn merge(&mut self, other: &Self) {
         self.merge_entries(other.entries(), None);
         self.merge_marks(other.marks(), None);
@@ -161,13 +163,13 @@ impl ReputationLedger {
             .collect()
     }
 
-    /// The reputations to publish: scores from the remembered votes by [`ReputationConfig::mean`], 0.30 to 1.00, and
-    /// the counts of all votes.
+    /// The reputations to publish: scores from the kept votes by [`ReputationConfig::mean`], 0.30
+    /// to 1.00, and the counts of all votes.
     pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         self.reputations_beside(config, &BTreeMap::new())
     }
 
-    /// The same, beside votes of other cells, by [`ReputationConfig::mean_with`].
+    /// The same reputations, including votes of other cells, by [`ReputationConfig::mean_with`].
     pub fn reputations_beside(
         &self,
         config: &ReputationConfig,
@@ -196,7 +198,7 @@ impl ReputationLedger {
         totals.into_iter().map(reputation).collect()
     }
 
-    /// (correct, incorrect) among each vehicle's so many latest votes.
+    /// (correct, incorrect) among each vehicle's `memory_votes` latest votes.
     fn latest(&self, memory_votes: f64) -> BTreeMap<&NodeName, (f64, f64)> {
         let mut latest: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
         for (node, record) in self.latest_first() {
@@ -207,7 +209,8 @@ impl ReputationLedger {
         latest
     }
 
-    /// What other cells are told of each vehicle; of its votes the `memory_votes` latest are remembered.
+    /// The counts of each vehicle to send to other cells; the `memory_votes` latest votes count as
+    /// kept.
     pub fn cell_counts(&self, memory_votes: f64) -> BTreeMap<NodeName, CellCounts> {
         let latest = self.latest(memory_votes);
         let counts = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
@@ -229,8 +232,9 @@ impl ReputationLedger {
         self.totals().into_iter().map(counts).collect()
     }
 
-    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest, without the very
-    /// latest ones, of which `own` gives the number. Each lane's votes are divided among labels as in the whole lane.
+    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest,
+    /// without the very latest ones, whose number `own` returns. Each lane's votes are divided
+    /// among labels as in the whole lane.
     pub fn remembered(
         &self,
         memory_votes: f64,

@@ -11,9 +11,10 @@ const DENSE: u64 = 4;
 
 /// A vehicle's counts in one lane at multiples of [`SPACING`] votes, by that multiple.
 ///
-/// Of marks that lie n back, those at multiples of the greatest power of two up to n/2 are kept. These are two for every
-/// doubling, so that the beginning of any span of votes is known to within half of it. The set of kept marks only shrinks
-/// as the latest mark rises, so that merging and then dropping is a join.
+/// Of the marks that lie n back, those at multiples of the greatest power of two up to n/2 are
+/// kept. There are two for every doubling, so that the beginning of any span of votes is determined
+/// to within half of it. The set of kept marks only shrinks as the latest mark rises, so that
+/// merging and then dropping is a join.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Marks(BTreeMap<u64, Counts>);
 
@@ -26,7 +27,7 @@ impl Marks {
         self.0.iter().map(|(number, counts)| (*number, *counts))
     }
 
-    /// Merges a mark, taking the larger counts; true when that changed anything.
+    /// Merges a mark, taking the larger counts; true if that changed anything.
     pub(super) fn insert(&mut self, number: u64, counts: Counts) -> bool {
         if !self.would_keep(number) {
             return false;

@@ -1,4 +1,5 @@
-//! Replication: counts and marks of the ledger in pieces that fit into messages, how they are merged, and their bounds.
+//! Replication: counts and marks of the ledger in pieces that fit into messages, how they are
+//! merged, and their bounds.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,9 +14,10 @@ use crate::wire::{LedgerEntry, LedgerMark};
 /// Maximum number of lanes: the latest are kept. One aggregator has at most half of them.
 pub const MAX_LANES: usize = 128;
 
-/// Maximum number of counts and marks, of which one aggregator has at most half. For a new one the oldest lanes are
-/// dropped: those of its own aggregator if that one has its half. It is not taken where only its own and later lanes are
-/// left, except in the present leader's lane, to which later lanes give way too.
+/// Maximum number of counts and marks, of which one aggregator has at most half. For a new entry
+/// the oldest lanes are dropped: lanes of its own aggregator if that aggregator has its half. The
+/// entry is refused if only its own and later lanes remain, except in the current leader's lane,
+/// for which later lanes are dropped too.
 pub const MAX_ENTRIES: usize = 131_072;
 
 /// The key of a count: an entry without its numbers.
@@ -40,7 +42,7 @@ impl ReputationLedger {
         })
     }
 
-    /// The counts that `keys` name, as they are now.
+    /// The current counts of `keys`.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
             Some(entry(
@@ -82,7 +84,7 @@ impl ReputationLedger {
         })
     }
 
-    /// Number of votes that are known of a mark's vehicle in its lane.
+    /// Number of votes in the ledger of a mark's vehicle in its lane.
     pub fn votes_of(&self, mark: &LedgerMark) -> u64 {
         self.record_of(mark.epoch, &mark.aggregator, &mark.node)
             .map_or(0, |record| record.sum.total())
@@ -106,10 +108,11 @@ impl ReputationLedger {
         self.lanes.contains_key(lane)
     }
 
-    /// Takes the larger of every count; true when that changed anything.
+    /// Takes the larger of every count; returns true if that changed any.
     ///
-    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are forgotten, so that all who merge the same entries
-    /// forget the same lanes. The lane of the `present` leader always has room and is never forgotten.
+    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are dropped, so that all nodes
+    /// that merge the same entries drop the same lanes. The lane of the `present` leader always has
+    /// room and is not dropped.
     pub fn merge_entries(
         &mut self,
         entries: impl IntoIterator<Item = LedgerEntry>,
@@ -159,7 +162,8 @@ impl ReputationLedger {
         }
     }
 
-    /// The marks that `evidence` reached in a lane; it must be what was recorded there last.
+    /// The marks that `evidence` reached in a lane; it must be the evidence that was recorded there
+    /// last.
     pub fn marks_reached(
         &self,
         epoch: u64,
@@ -180,7 +184,8 @@ impl ReputationLedger {
         votes.into_iter().filter_map(reached).collect()
     }
 
-    /// Takes in marks, within the bounds of [`Self::merge_entries`]; true when that changed anything.
+    /// Merges marks, within the bounds of [`Self::merge_entries`]; returns true if that changed
+    /// any.
     pub fn merge_marks(
         &mut self,
         marks: impl IntoIterator<Item = LedgerMark>,
@@ -224,7 +229,8 @@ impl ReputationLedger {
         self.lanes.len()
     }
 
-    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one more count.
+    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one
+    /// more count.
     pub(super) fn record_mut(
         &mut self,
         lane: &Epoch,
@@ -249,8 +255,8 @@ impl ReputationLedger {
         )
     }
 
-    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
-    /// left do not give way to it.
+    /// Drops the oldest lanes until there is room for one more count or mark in `lane`; returns
+    /// false if the remaining lanes must be kept.
     fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
         loop {
             let is_new = !self.lanes.contains_key(lane);
@@ -275,8 +281,8 @@ impl ReputationLedger {
         }
     }
 
-    /// Forgets the oldest lane except the present one, of the same aggregator or of all, if it is older than `lane` or
-    /// `lane` is the present one.
+    /// Drops the oldest lane except the current one, of the same aggregator or of all, if it is
+    /// older than `lane` or `lane` is the current one.
     fn forget_oldest(
         &mut self,
         lane: &Epoch,
@@ -296,7 +302,7 @@ impl ReputationLedger {
         true
     }
 
-    /// Forgets a lane.
+    /// Drops a lane.
     pub(super) fn forget(&mut self, lane: &Epoch) {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);
@@ -304,7 +310,8 @@ impl ReputationLedger {
         self.on_trial.remove(lane);
     }
 
-    /// Notes that so many counts and marks of an aggregator became so many.
+    /// Records that the number of counts and marks of an aggregator changed from `before` to
+    /// `after`.
     pub(super) fn resize(&mut self, aggregator: &NodeName, before: usize, after: usize) {
         let size =
             (self.sizes.remove(aggregator).unwrap_or_default() + after).saturating_sub(before);

@@ -1,7 +1,8 @@
 //! Signed evidence: counts that come from the signed shares of their aggregators.
 //!
-//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is
-//! revoked, its statements go, and the counts with them. Statements on trial count, and are neither passed on nor saved.
+//! A node that passes a lane on sends the signed shares of the lane's aggregator. When the
+//! certificate of an aggregator is revoked, its statements are dropped together with their counts.
+//! Statements on probation count, but are not passed on or saved.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -14,14 +15,14 @@ use crate::model::time::Timestamp;
 use crate::wire::LedgerShare;
 
 impl ReputationLedger {
-    /// Takes in the counts and marks of a share; true when that changed anything.
+    /// Merges the counts and marks of a share; returns true if that changed any.
     pub fn merge_share(&mut self, share: &LedgerShare, present: Option<&Epoch>) -> bool {
         self.merge_entries(share.entries.iter().cloned(), present)
             | self.merge_marks(share.marks.iter().cloned(), present)
     }
 
-    /// Takes in a share that its aggregator signed, and keeps it. The signature is verified before; the share is of one
-    /// lane. True when that changed any count or mark.
+    /// Merges and stores a share signed by its aggregator. The caller has verified the signature;
+    /// the share contains one lane. Returns true if that changed any count or mark.
     pub fn merge_statement(&mut self, share: &Arc<LedgerShare>, present: Option<&Epoch>) -> bool {
         let changed = self.merge_share(share, present);
         if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
@@ -31,7 +32,7 @@ impl ReputationLedger {
         changed
     }
 
-    /// As [`Self::merge_statement`], on trial until `ends_at`.
+    /// As [`Self::merge_statement`], on probation until `ends_at`.
     pub fn merge_on_trial(
         &mut self,
         share: &Arc<LedgerShare>,
@@ -48,8 +49,9 @@ impl ReputationLedger {
         changed
     }
 
-    /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. The
-    /// result is their lanes, and whether each is evidence now.
+    /// Ends probations: of the lanes that `has_failed` selects, whose shares and counts are
+    /// dropped, and of those whose time is over. Returns these lanes, and whether each is evidence
+    /// now.
     pub fn end_trials(
         &mut self,
         now: Timestamp,
@@ -80,17 +82,17 @@ impl ReputationLedger {
         ended
     }
 
-    /// The signed shares behind the lanes of other aggregators, without those on trial.
+    /// The signed shares of other aggregators' lanes, without those on probation.
     pub fn statements(&self) -> impl Iterator<Item = &Arc<LedgerShare>> {
         self.statements.values().flat_map(|lane| &lane.signed)
     }
 
-    /// True if the counts of a lane come from signed shares. Those that this node counted itself do not.
+    /// True if the counts of a lane come from signed shares. This node's own counts do not.
     pub fn is_stated(&self, lane: &Epoch) -> bool {
         self.statements.contains_key(lane) || self.on_trial.contains_key(lane)
     }
 
-    /// Drops what this node counted itself, under the name `aggregator`; true if there was any.
+    /// Drops this node's own counts, under the name `aggregator`; returns true if there were any.
     pub fn forget_own(&mut self, aggregator: &NodeName) -> bool {
         let is_own = |lane: &&Epoch| lane.leader == *aggregator && !self.is_stated(lane);
         let own: Vec<_> = self.lanes.keys().filter(is_own).cloned().collect();
@@ -98,7 +100,8 @@ impl ReputationLedger {
         !own.is_empty()
     }
 
-    /// Drops the signed shares that are not valid, and the counts that came by them alone; true if there were any.
+    /// Drops the signed shares that are invalid, and counts that come only from them; returns true
+    /// if there were any.
     pub fn retain_statements(&mut self, mut is_valid: impl FnMut(&LedgerShare) -> bool) -> bool {
         let mut has_dropped = false;
         let lanes: BTreeSet<_> = self

@@ -1,14 +1,16 @@
-//! Statements: the signed shares of one lane. Those to which later ones leave nothing to add are dropped from time to time.
+//! Statements: the signed shares of one lane. Statements that are fully covered by later ones are
+//! dropped from time to time.
 
 use std::sync::Arc;
 
 use crate::wire::{LedgerShare, MAX_SHARE_ENTRIES};
 
-/// Number of statements of a lane beyond those of the last clearing at which it is cleared again.
+/// Number of statements of a lane, in addition to those left by the last clearing, at which it is
+/// cleared again.
 const MAX_NEW: usize = 16;
 
-/// Maximum size of a lane's statements, in multiples of the lane's own. An aggregator that signs each vehicle's counts
-/// apart in full statements is kept in part only.
+/// Maximum size of a lane's statements, in multiples of the lane's own size. If an aggregator signs
+/// each vehicle's counts in a separate full statement, only a part of the statements is kept.
 const MAX_COPIES: usize = 4;
 
 /// The statements behind one lane.
@@ -16,13 +18,13 @@ const MAX_COPIES: usize = 4;
 pub(super) struct Statements {
     /// The latest last.
     pub(super) signed: Vec<Arc<LedgerShare>>,
-    /// Number of statements at which those that add nothing are dropped.
+    /// Number of statements at which redundant statements are dropped.
     clear_at: usize,
 }
 
 impl Statements {
-    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into evidence that is empty at
-    /// first, the latest statement first: true if that changed anything.
+    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into
+    /// initially empty evidence, the latest statement first, and returns true if that changed any.
     pub(super) fn push(
         &mut self,
         share: Arc<LedgerShare>,
@@ -35,7 +37,7 @@ impl Statements {
         }
     }
 
-    /// Drops the statements to which later ones leave nothing to add.
+    /// Drops the statements that are fully covered by later ones.
     fn clear(&mut self, lane_size: usize, mut adds: impl FnMut(&LedgerShare) -> bool) {
         let mut room = MAX_COPIES * (lane_size + MAX_SHARE_ENTRIES);
         let is_needed = |share: &Arc<LedgerShare>| {

@@ -84,7 +84,7 @@ fn partitions_that_counted_apart_merge_to_their_sum() {
     assert_eq!(left.totals()[&name("euclid")], (3, 0));
 }
 
-/// 10,000 right votes, and then wrong ones, in one lane.
+/// 10,000 right votes, followed by wrong ones, in one lane.
 fn turncoat(wrong: u64) -> ReputationLedger {
     let mut ledger = ReputationLedger::default();
     for number in 0..10_000 + wrong {
@@ -161,7 +161,7 @@ fn what_is_remembered_before_ones_own_votes_is_the_others() {
         let labels = votes[&NodeName::from_static("turncoat")].values();
         labels.fold((0.0, 0.0), |sum, votes| (sum.0 + votes.0, sum.1 + votes.1))
     };
-    // Where the 500 began lies between two marks.
+    // The beginning of the 500 votes lies between two marks.
     let (correct, incorrect) = remembered(0);
     assert!(
         correct < 10.0 && (correct + incorrect - 500.0).abs() < 1e-6,
@@ -185,7 +185,7 @@ fn counts(correct: u64, incorrect: u64) -> CellCounts {
     }
 }
 
-/// What some cells say of a vehicle, and the score from which it starts.
+/// The initial score of a vehicle, given some cells' counts.
 fn start_score(said: &[CellCounts], trust: f64) -> f64 {
     let config = ReputationConfig::default();
     let mut foreign = ForeignReputations::default();
@@ -210,7 +210,7 @@ prop_compose! {
 }
 
 proptest! {
-    /// Messages come late, twice, or in any order, and more cells speak than are kept.
+    /// Messages arrive late, twice, or in any order, and more cells send counts than are kept.
     #[test]
     fn what_cells_say_is_the_same_in_any_order(
         said in proptest::collection::vec((0u64..24, 0u64..3, 1u64..6), 0..80),
@@ -245,8 +245,8 @@ proptest! {
         prop_assert_eq!(merged(&[a, merged(&[b, c])]), merged(&[merged(&[a, b]), c]));
     }
 
-    /// Whatever one cell says, and however often: a newcomer's score moves by a sixth at most, and is above that of a vehicle
-    /// whose evidence tracking takes for worthless.
+    /// With any counts in any number of messages of one cell, a newcomer's score moves by a sixth
+    /// at most, and stays above the score that tracking treats as worthless.
     #[test]
     fn one_cell_alone_moves_a_start_by_a_bounded_amount(correct in 0..=crate::wire::MAX_INTEGER, incorrect in 0..=crate::wire::MAX_INTEGER) {
         let score = start_score(&[counts(correct, incorrect)], 1.0);
@@ -273,7 +273,7 @@ fn a_liar_that_moves_on_starts_below_a_newcomer_and_a_proven_vehicle_above() {
         0.5,
         "a cell that nobody believes says nothing"
     );
-    // It was right for long and turned, and the cell remembers the latest votes.
+    // The vehicle was right for long and then wrong, and the cell keeps the latest votes.
     let turned = CellCounts {
         old: Counts {
             correct: 9_900,

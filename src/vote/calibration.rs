@@ -1,4 +1,5 @@
-//! Calibration: the weight of a stated confidence, learned from agreement with the other vehicles.
+//! Calibration: the weight of a stated confidence, estimated from agreement with the other
+//! vehicles.
 
 use std::collections::BTreeSet;
 
@@ -10,15 +11,15 @@ const BINS: usize = 20;
 const RANK_PRIOR_VOTES: f64 = 5.0;
 /// Weight, in votes, of the overall rate of agreement against a band's own.
 const BAND_PRIOR_VOTES: f64 = 100.0;
-/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the chance spread of ten equal
-/// bands, 1/2 + … + 1/10 (Barlow et al. 1972).
+/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the
+/// chance spread of ten equal bands, 1/2 + … + 1/10 (Barlow et al. 1972).
 const NOISE: f64 = 6.0;
 /// Votes over which settled agreement fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and greatest weight of a vote for its confidence.
 const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
-/// Agreement of votes with those of the other vehicles, by band.
+/// Agreement of votes with the other vehicles' votes, by band.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct BandCounts {
     agreed: [f64; BANDS],
@@ -48,15 +49,17 @@ struct ConfidenceHistogram {
 
 /// Weights of confidences.
 ///
-/// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be another's 0.9. A
-/// vehicle's overall quality is its reputation; its confidence tells which of its votes are better than others.
+/// A detector's confidence orders its detections but is not a probability: one vehicle's 0.6 may be
+/// another's 0.9. A vehicle's overall quality is its reputation; its confidence ranks its votes by
+/// quality.
 ///
 /// - A vote's band is the rank of its confidence among all of the vehicle's.
-/// - Its weight is the log-odds of being right in that band, divided by the log-odds over all bands.
-/// - The weights are made non-decreasing by pooling adjacent violators (Barlow et al. 1972; Zadrozny & Elkan 2002):
-///   confidence that misleads has no effect.
-/// - Of the differences between bands only the part beyond chance is kept (James & Stein 1961): confidence that is
-///   uninformative has no effect.
+/// - Its weight is the log-odds of being right in that band, divided by the log-odds over all
+///   bands.
+/// - The weights are made non-decreasing by pooling adjacent violators (Barlow et al. 1972;
+///   Zadrozny & Elkan 2002): confidence that misleads has no effect.
+/// - Of the differences between bands only the part beyond chance is kept (James & Stein 1961):
+///   confidence that is uninformative has no effect.
 /// - Until there is evidence, the weight is the stated confidence divided by the mean of all.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ConfidenceCalibration {
@@ -69,7 +72,8 @@ pub(super) struct ConfidenceCalibration {
 }
 
 impl ConfidenceCalibration {
-    /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
+    /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in
+    /// votes.
     pub(super) fn new(prior_votes: f64) -> Self {
         Self {
             prior_votes,
@@ -77,7 +81,7 @@ impl ConfidenceCalibration {
         }
     }
 
-    /// Goes on with another weight of stated confidences.
+    /// Applies another weight of stated confidences.
     pub(super) fn configure(&mut self, prior_votes: f64) {
         self.prior_votes = prior_votes;
     }
@@ -94,7 +98,7 @@ impl ConfidenceCalibration {
         histogram.total += 1.0;
     }
 
-    /// Forgets the confidences of vehicles, whose indices may be reused.
+    /// Removes the confidences of vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
             if let Some(histogram) = self.histograms.get_mut(vehicle) {
@@ -116,7 +120,8 @@ impl ConfidenceCalibration {
         ((rank * BANDS as f64) as usize).min(BANDS - 1)
     }
 
-    /// Counts a live vote that the others support with probability `agreement`; `sign` −1 takes it back.
+    /// Counts a live vote that the others support with probability `agreement`; with `sign` −1
+    /// subtracts it.
     pub(super) fn count(&mut self, band: usize, agreement: f64, sign: f64) {
         self.live.add(band, agreement, sign);
     }
@@ -127,12 +132,12 @@ impl ConfidenceCalibration {
         self.settled.add(band, agreement, 1.0);
     }
 
-    /// Replaces the live evidence by that of `other`.
+    /// Replaces the live evidence by the live evidence of `other`.
     pub(super) fn take_live(&mut self, other: Self) {
         self.live = other.live;
     }
 
-    /// Forgets the live evidence.
+    /// Clears the live evidence.
     pub(super) fn clear_live(&mut self) {
         self.live = BandCounts::default();
     }
@@ -189,13 +194,14 @@ fn pool_adjacent_violators(bands: &BandCounts) -> Vec<(f64, f64, usize)> {
     pools
 }
 
-/// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate for all.
+/// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate
+/// for all.
 fn shrinkage(pools: &[(f64, f64, usize)]) -> f64 {
     let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
     let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| {
         (a + agreed, n + votes)
     });
-    // Counts that are taken back leave rounding errors: more votes may seem to have agreed than there are.
+    // Subtracted counts leave rounding errors: more votes may seem to have agreed than there are.
     let rate = (agreed / f64::max(votes, 1e-9)).clamp(0.0, 1.0);
     let spread: f64 = with_votes()
         .map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2))

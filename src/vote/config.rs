@@ -15,10 +15,10 @@ pub const MAX_LABELS: usize = 65_535;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
-    /// Learned reputation × calibrated confidence × visibility; the default.
+    /// Estimated reputation × calibrated confidence × visibility; the default.
     #[default]
     Weighted,
-    /// The paper's formulas to the letter.
+    /// The paper's formulas without changes.
     Paper,
 }
 
@@ -32,17 +32,19 @@ pub struct VoteConfig {
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Maximum number of landmarks; beyond it an open cell forgets the oldest. Default 1024. Bounds memory.
+    /// Maximum number of landmarks; beyond it an open cell drops the oldest landmark. Default 1024.
+    /// Bounds memory.
     pub max_landmarks: usize,
-    /// Maximum number of vehicles. Beyond it long silent ones are forgotten; without any, reports of new vehicles are
-    /// rejected. Default 256. Bounds memory.
+    /// Maximum number of vehicles. Beyond it vehicles that have been silent for long are dropped;
+    /// if there are none, reports of new vehicles are rejected. Default 256. Bounds memory.
     pub max_vehicles: usize,
-    /// Maximum number of distinct labels of the cell, in `paper` mode of a landmark. Default 256. Bounds memory. Beyond
-    /// it the least useful labels are forgotten, first those of the vehicle that introduced most. In `paper` mode, whose
-    /// sums never end, votes for new labels are ignored.
+    /// Maximum number of distinct labels in the cell or, in `paper` mode, of a landmark.
+    /// Default 256. Bounds memory. Beyond it the least useful labels are dropped, beginning with
+    /// labels of the vehicle that introduced most. In `paper` mode, whose sums are permanent, votes
+    /// for new labels are ignored.
     pub max_labels: usize,
-    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
-    /// Default: none.
+    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's
+    /// own synonyms have precedence. Default: no synonyms.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
 }
@@ -65,7 +67,7 @@ impl VoteConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first value out of range.
+    /// Returns a [`ConfigError`] that names the first value out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_landmarks", self.max_landmarks as f64, 1.0, 1e6)?;
         check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e5)?;
@@ -79,7 +81,8 @@ impl VoteConfig {
 config_section! {
     /// Settings of `paper` mode.
     pub struct PaperConfig {
-        /// Distance d_max in metres beyond which a vote is ignored; default 2.54, the 100 in of the paper's testbed.
+        /// Distance d_max in metres beyond which a vote is ignored; default 2.54, the 100 in of the
+        /// paper's testbed.
         pub max_range_m: f64 = 2.54, in 1e-3 to 1e6;
         /// Weight p_d of distance against angle, 0 to 1; default 0.7.
         pub distance_weight: f64 = 0.7, in 0.0 to 1.0;
@@ -87,56 +90,68 @@ config_section! {
         pub initial_reputation: f64 = 0.5, in 0.3 to 1.0;
         /// Change of r_v after a verdict in which every vote was right; default 0.01.
         pub step: f64 = 0.01, in 0.0 to 1.0;
-        /// Frames of a vehicle between verdicts; default 5. A round closes when any vehicle has sent this many.
+        /// Frames of a vehicle between verdicts; default 5. A round closes when any vehicle has
+        /// sent this many.
         pub frames_per_verdict: u32 = 5, in 1.0 to 1e6;
     }
 }
 
 config_section! {
-    /// Settings of `weighted` mode. Weights in votes are pseudo-counts: the number of votes that outweighs an assumption.
+    /// Settings of `weighted` mode. Weights in votes are pseudo-counts: the number of votes that
+    /// outweighs an assumption.
     pub struct WeightedConfig {
-        /// Time in seconds that a vote counts; default 2. Longer survives gaps, shorter follows change. A vehicle adds to
-        /// the evidence about a landmark once in this time, however fast it publishes.
+        /// Time in seconds for which a vote counts; default 2. A longer time bridges gaps, a
+        /// shorter time follows changes. A vehicle adds to the evidence about a landmark once in
+        /// this time, independent of its publishing rate.
         pub freshness_s: f64 = 2.0, in 1e-3 to 1e12;
-        /// Part of `freshness_s` in which a vehicle's statement on a landmark fades to 1/e in its present vote; default 0.5.
-        /// More suppresses more single frames with a wrong label, but notices a new object later. 0 takes the last statement
-        /// alone, for inputs in which a new statement corrects the earlier one.
+        /// Part of `freshness_s` in which a vehicle's statement on a landmark fades to 1/e in its
+        /// current vote; default 0.5. A higher value suppresses more single frames with a wrong
+        /// label, but notices a new object later. With 0 only the last statement counts, for inputs
+        /// in which a new statement corrects the earlier one.
         pub smoothing_share: f64 = 0.5, in 0.0 to 10.0;
-        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
-        /// class; default 5. Less learns classes faster from noise.
+        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion
+        /// against the vehicle's own record of one class; default 5. A lower value adapts to
+        /// classes faster, but also to noise.
         pub class_prior_votes: f64 = 5.0, in 1e-3 to 1e6;
         /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
         pub vehicle_prior_votes: f64 = 8.0, in 1e-3 to 1e6;
         /// Assumed rate of right votes of a vehicle without evidence, 0.5 to 1; default 0.7.
         pub assumed_accuracy: f64 = 0.7, in 0.5 to 0.999;
-        /// Share of the fleet's confusion in the assumed distribution of errors; the rest is spread evenly over all wrong
-        /// labels. Default 0.5.
+        /// Share of the fleet's confusion in the assumed distribution of errors; the rest is spread
+        /// evenly over all wrong labels. Default 0.5.
         pub confusion_sharing: f64 = 0.5, in 0.0 to 1.0;
-        /// Maximum weight of the shares of the classes, in verdicts; default 100. More favours frequent labels.
+        /// Maximum weight of the shares of the classes, in verdicts; default 100. A higher value
+        /// favours frequent labels.
         pub class_share_verdicts: f64 = 100.0, in 2.0 to 1e9;
-        /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
+        /// Votes over which the memory of a vehicle fades to 1/e; default 500. A lower value
+        /// notices a change of behaviour sooner.
         pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
-        /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
-        /// that vehicles begin to copy each other, longer finds fainter dependence.
+        /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100.
+        /// A lower value notices sooner that vehicles begin to copy each other, a higher one finds
+        /// weaker dependence.
         pub pair_memory_votes: f64 = 100.0, in 2.0 to 1e9;
         /// Votes until a vehicle counts as proven; default 10.
         pub probation_votes: f64 = 10.0, in 0.0 to 1e6;
-        /// Maximum weight of all newcomers at a landmark, as a multiple of the proven vehicles'; default 0.5. Bounds the gain
-        /// of an attacker who rejoins under new names; larger lets newcomers in sooner.
+        /// Maximum weight of all newcomers at a landmark, as a multiple of the proven vehicles';
+        /// default 0.5. Bounds the gain of an attacker who rejoins under new names; a higher value
+        /// lets newcomers have influence sooner.
         pub newcomer_share: f64 = 0.5, in 0.0 to 1e9;
-        /// Probability by which a label must lead the one published to replace it; default 0.1. More flickers less, reacts
-        /// later.
+        /// Probability by which a label must lead the published label to replace it; default 0.1. A
+        /// higher value flickers less and reacts later.
         pub hysteresis: f64 = 0.1, in 0.0 to 0.99;
-        /// Distance in metres beyond which a vote is ignored; default 50. Set it to the reliable range of the detector.
+        /// Distance in metres beyond which a vote is ignored; default 50. Set it to the reliable
+        /// range of the detector.
         pub max_range_m: f64 = 50.0, in 1e-3 to 1e6;
         /// Angle off the camera's axis in radians at which visibility has halved; default 0.8.
         pub half_visibility_rad: f64 = 0.8, in 1e-3 to 10.0;
-        /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
+        /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the
+        /// square of the distance.
         pub visibility_at_max_range: f64 = 0.3, in 1e-3 to 1.0;
-        /// Votes on older landmarks that are judged again per fresh vote; default 8. More settles sooner, costs more.
+        /// Votes on older landmarks that are re-evaluated per fresh vote; default 8. A higher value
+        /// settles sooner and costs more.
         pub revisit_votes: f64 = 8.0, in 0.0 to 1e6;
-        /// Weight, in votes, of stated confidences against calibrated ones; default 10. More trusts stated confidences for
-        /// longer.
+        /// Weight, in votes, of stated confidences against calibrated ones; default 10. A higher
+        /// value uses stated confidences for longer.
         pub calibration_votes: f64 = 10.0, in 1e-3 to 1e9;
     }
 }

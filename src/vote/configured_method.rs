@@ -5,7 +5,6 @@ use super::method::VotingMethod;
 use super::paper::PaperVoting;
 use super::weighted::WeightedVoting;
 
-/// The configured method.
 #[derive(Debug, Clone)]
 pub(super) enum ConfiguredMethod {
     Paper(PaperVoting),

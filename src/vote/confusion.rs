@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
 
-/// Scale below which counts are written anew.
+/// Scale below which all counts are rescaled.
 const MIN_SCALE: f64 = 1e-60;
 
-/// Sparse expected counts of (true label, stated label): pairs that never occurred take no memory. All counts share one
-/// scale, so that the cost of fading does not depend on their number.
+/// Sparse expected counts of (true label, stated label): pairs that did not occur take no memory.
+/// All counts share one scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
     cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
@@ -32,7 +32,7 @@ impl Default for Confusion {
 }
 
 impl Confusion {
-    /// Adds `weight`; a negative one takes evidence back.
+    /// Adds `weight`; a negative weight removes evidence.
     pub(super) fn add(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
         self.add_scaled(truth, stated, weight / self.scale);
     }
@@ -46,7 +46,7 @@ impl Confusion {
         }
     }
 
-    /// Forgets all evidence about any of `labels`.
+    /// Removes all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
             labels.contains(&truth) || labels.contains(&stated)

@@ -1,4 +1,5 @@
-//! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical priors.
+//! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical
+//! priors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,26 +15,28 @@ use crate::wire::ForeignVotes;
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VehicleEvidence {
-    /// Evidence of fresh votes, which may be judged again.
+    /// Evidence of fresh votes, which may be re-evaluated.
     pub(super) live: Confusion,
     /// Fading evidence of votes that went stale.
     pub(super) settled: Confusion,
     /// Fading evidence from the ledger of other aggregators.
     pub(super) inherited: Confusion,
-    /// Votes of other cells. They weigh its statements, and prove nothing about it.
+    /// Votes of other cells. They weight the vehicle's statements, but are not evidence for
+    /// conclusions about it.
     pub(super) foreign: ForeignVotes,
     /// Cumulative sum of the drop in the vehicle's rate of right votes.
     shortfall: f64,
-    /// Log-odds of being right minus those of the fleet on the same classes, by coupling.
+    /// Log-odds of being right minus the fleet's log-odds on the same classes, by coupling.
     advantage: [f64; 2],
 }
 
-/// How the probabilities of the classes hang together.
+/// The relation between the probabilities of the classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Coupling {
-    /// Each class has its own, with priors.
+    /// Each class has its own probabilities, with priors.
     Free,
-    /// A vehicle is right equally often on every class, and wrong labels are equally likely: the one-coin model.
+    /// A vehicle is right equally often on every class, and wrong labels are equally likely: the
+    /// one-coin model.
     Tied,
 }
 
@@ -42,7 +45,8 @@ impl VehicleEvidence {
         self.live.correct() + self.settled.correct() + self.inherited.correct()
     }
 
-    /// Page's (1954) cumulative sum test: after a sudden drop in right votes most of the vehicle's past is forgotten.
+    /// Page's (1954) cumulative sum test: after a sudden drop in right votes most of the vehicle's
+    /// past is dropped.
     fn watch_for_drop(&mut self, right: f64) {
         let past = self.settled.total() + self.inherited.total();
         let usual = (self.settled.correct() + self.inherited.correct()) / past.max(1.0);
@@ -71,10 +75,11 @@ struct FleetRow {
 
 /// Confusion of each vehicle and of the fleet, and the shares of the classes.
 ///
-/// A vehicle's probability of stating `l` where `t` is true has a Dirichlet prior. The prior's mean is the fleet's
-/// confusion, shifted in log-odds by the vehicle's overall reliability. That reliability is shrunk towards the fleet's.
-/// The fleet's confusion has a Dirichlet prior too, whose mean is one accuracy for all classes. Classes are judged one by
-/// one only if that predicts votes better; see [`Coupling`].
+/// A vehicle's probability of stating `l` where `t` is true has a Dirichlet prior. The prior's mean
+/// is the fleet's confusion, shifted in log-odds by the vehicle's overall reliability. That
+/// reliability is shrunk towards the fleet's. The fleet's confusion has a Dirichlet prior too,
+/// whose mean is one accuracy for all classes. Classes are modelled individually only if that
+/// predicts votes better; see [`Coupling`].
 #[derive(Debug, Clone, Default)]
 pub(super) struct DawidSkene {
     config: WeightedConfig,
@@ -85,31 +90,35 @@ pub(super) struct DawidSkene {
     /// Expected number of landmarks of each label.
     shares: Vec<f64>,
     log_shares: Vec<f64>,
-    /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and number of these votes.
+    /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and
+    /// number of these votes.
     saving: (f64, f64),
-    /// The same by the ledger of other aggregators.
+    /// The same saving, by the ledger of other aggregators.
     inherited_saving: (f64, f64),
 }
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
 const FLEET_PRIOR_VOTES: f64 = 1.0;
-/// The same against the fleet's record, as a share of all its votes: a class that few votes are about keeps close to the
-/// accuracy of all.
+/// Weight against the fleet's record, as a share of all its votes: a class with few votes stays
+/// close to the accuracy of all.
 const FLEET_PRIOR_SHARE: f64 = 0.05;
 /// Factor on the weight of the fleet's reliability while the classes are tied.
 const TIED_PRIOR_FACTOR: f64 = 4.0;
-/// Log loss per vote that classes judged one by one must save, in nats. A model that is wrong otherwise, such as about
-/// items that are hard for all, feigns smaller savings (Miller & Dunson 2019).
+/// Log loss per vote that individual classes must save, in nats. A model that is wrong in another
+/// respect, for example about items that are hard for all vehicles, produces smaller apparent
+/// savings (Miller & Dunson 2019).
 const MIN_SAVING: f64 = 0.01;
-/// Saving in all, in nats, that may be chance.
+/// Total saving, in nats, that may be chance.
 const CHANCE_SAVING: f64 = 5.0;
-/// Probability at least that a vote is wrong, or right, before rates by label in a ledger are compared with it.
+/// Probability at least that a vote is wrong, or right, before rates by label in a ledger are
+/// compared with it.
 const MIN_WRONG: f64 = 0.01;
 /// Votes over which savings fade to 1/e.
 const SAVING_MEMORY_VOTES: f64 = 20_000.0;
 /// Drop in the rate of right votes that is tolerated.
 const SHORTFALL_SLACK: f64 = 0.2;
-/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with 80 % right ones.
+/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with
+/// 80 % right ones.
 const SHORTFALL_ALARM: f64 = 4.0;
 /// Part of a vehicle's past that still counts after a change.
 const KEPT_AFTER_ALARM: f64 = 0.1;
@@ -122,7 +131,7 @@ impl DawidSkene {
         }
     }
 
-    /// Goes on under other settings.
+    /// Applies other settings.
     pub(super) fn configure(&mut self, config: WeightedConfig) {
         self.config = config;
     }
@@ -153,7 +162,7 @@ impl DawidSkene {
         support
     }
 
-    /// Forgets labels, none of which is in the live evidence; their indices may be reused.
+    /// Removes labels that do not occur in the live evidence; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         labels
             .iter()
@@ -203,8 +212,9 @@ impl DawidSkene {
         }
     }
 
-    /// Judges new votes by the coupling that predicts votes better, after both have predicted every one of these votes from
-    /// the others. The model must not contain the votes yet: the evidence on the coupling is prequential (Dawid 1984).
+    /// Evaluates new votes by the coupling that predicts votes better, after both couplings have
+    /// predicted every one of these votes from the others. The model must not contain the votes
+    /// yet: the evidence on the coupling is prequential (Dawid 1984).
     pub(super) fn judge_new(
         &mut self,
         votes: &[WeightedVote],
@@ -233,7 +243,8 @@ impl DawidSkene {
         }
     }
 
-    /// Judges votes that the model does not contain; newcomers together are limited to their share.
+    /// Evaluates votes that the model does not contain; newcomers together are limited to their
+    /// share.
     pub(super) fn judge(
         &self,
         votes: &[WeightedVote],
@@ -292,10 +303,11 @@ impl DawidSkene {
         judged
     }
 
-    /// Replaces the evidence on the coupling that comes from a ledger. It counts right and wrong votes of each vehicle by
-    /// stated label. Under equal accuracy on all classes, Bayes' rule still makes a rare label right less often than a
-    /// frequent one. Rates by label count as far as they explain more than that, and more than chance does: the Bayes factor
-    /// by Laplace's approximation (Kass & Raftery 1995).
+    /// Replaces the evidence on the coupling that comes from a ledger. It counts right and wrong
+    /// votes of each vehicle by stated label. Under equal accuracy on all classes, Bayes' rule
+    /// still makes a rare label right less often than a frequent one. Rates by label count as far
+    /// as they explain more than that, and more than chance does: the Bayes factor by Laplace's
+    /// approximation (Kass & Raftery 1995).
     pub(super) fn inherit_coupling<'a>(
         &mut self,
         vehicles: impl Iterator<Item = &'a RememberedVotes> + Clone,
@@ -333,13 +345,13 @@ impl DawidSkene {
         }
     }
 
-    /// Forgets the evidence on the coupling.
+    /// Clears the evidence on the coupling.
     pub(super) fn clear_coupling(&mut self) {
         self.saving = (0.0, 0.0);
     }
 
-    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::judge`] when
-    /// evidence has changed.
+    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before
+    /// [`Self::judge`] when evidence has changed.
     pub(super) fn refresh(&mut self, vehicles: impl Iterator<Item = usize>) {
         self.refresh_shares();
         let accuracy = self.fleet_accuracy();
@@ -374,8 +386,9 @@ impl DawidSkene {
         }
     }
 
-    /// James–Stein shrinkage of the shares towards equal ones (Hausser & Strimmer 2009). The number of draws is capped
-    /// at `class_share_verdicts`, because confusion and not sampling limits the accuracy of the shares.
+    /// James–Stein shrinkage of the shares towards equal ones (Hausser & Strimmer 2009). The number
+    /// of draws is capped at `class_share_verdicts`, because confusion and not sampling limits the
+    /// accuracy of the shares.
     fn refresh_shares(&mut self) {
         let total: f64 = self.shares.iter().map(|s| s.max(0.0) + 1.0).sum();
         let equal = 1.0 / self.labels.max(1) as f64;
@@ -492,15 +505,15 @@ impl DawidSkene {
         fleet.iter().map(stating).collect()
     }
 
-    /// Whether too few of a vehicle's votes are settled to trust it. Fresh votes do not prove it: a vehicle could send
-    /// many at once.
+    /// Whether too few of a vehicle's votes are settled to rely on it. Fresh votes do not count,
+    /// because a vehicle could send many at once.
     pub(super) fn is_newcomer(&self, vehicle: usize) -> bool {
         let evidence = &self.vehicles[vehicle];
         evidence.settled.total() + evidence.inherited.total() < self.config.probation_votes
     }
 
-    /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven vehicles'; 1 where no vehicle
-    /// is proven.
+    /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven
+    /// vehicles'; 1 where no vehicle is proven.
     pub(super) fn newcomer_factor(&self, votes: &[WeightedVote]) -> f64 {
         let (mut newcomers, mut proven) = (0.0, 0.0);
         for vote in votes {
@@ -518,7 +531,8 @@ impl DawidSkene {
         }
     }
 
-    /// Adds the votes as live evidence; `sign` −1 takes them back. A single vote is no evidence about its vehicle.
+    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote is not evidence
+    /// about its vehicle.
     pub(super) fn add_live(
         &mut self,
         votes: &[WeightedVote],
@@ -537,10 +551,11 @@ impl DawidSkene {
         }
     }
 
-    /// Adds a vote, which must not be live at present, to the fading evidence.
+    /// Adds a vote, which must not be live, to the fading evidence.
     ///
-    /// The vehicle is judged by the posterior of the `others`, the fleet by that of `all`. Otherwise few vehicles that
-    /// outvote one would together seem wrong more often than right.
+    /// The vehicle is evaluated by the posterior of the `others`, the fleet by the posterior of
+    /// `all`. Otherwise a few vehicles that outvote one would together seem wrong more often than
+    /// right.
     pub(super) fn settle(
         &mut self,
         vote: &WeightedVote,
@@ -569,7 +584,7 @@ impl DawidSkene {
         }
     }
 
-    /// Forgets all evidence that is not live.
+    /// Clears all evidence that is not live.
     pub(super) fn clear_settled(&mut self) {
         self.clear_coupling();
         self.inherited_saving = (0.0, 0.0);
@@ -580,7 +595,7 @@ impl DawidSkene {
         }
     }
 
-    /// Forgets all live evidence.
+    /// Clears all live evidence.
     pub(super) fn clear_live(&mut self) {
         self.live = Confusion::default();
         self.shares.iter_mut().for_each(|s| *s = 0.0);
@@ -597,8 +612,8 @@ impl DawidSkene {
         (evidence.correct() + prior * fleet) / (evidence.votes() + prior)
     }
 
-    /// The same beside votes of other cells: a vehicle's weight. What is concluded from evidence rests on
-    /// [`Self::reliability`], so that no cell's word alone voids any.
+    /// The reliability including votes of other cells: a vehicle's weight. Conclusions from
+    /// evidence use [`Self::reliability`], so that other cells' counts alone cannot void evidence.
     pub(super) fn reliability_beside(&self, vehicle: usize) -> f64 {
         let evidence = &self.vehicles[vehicle];
         let prior = self.config.vehicle_prior_votes;
@@ -610,8 +625,8 @@ impl DawidSkene {
 
 /// Probabilities in proportion to their squares, for evidence that is kept.
 ///
-/// Without this, the small probabilities of labels that are never true would add up: they would describe how such labels
-/// are stated, from votes on other labels only.
+/// Without this, the small probabilities of labels that do not occur would add up: they would
+/// describe how such labels are stated, from votes on other labels only.
 fn sharpened(posterior: &[(LabelIndex, f64)]) -> impl Iterator<Item = (LabelIndex, f64)> + '_ {
     let squares: f64 = posterior.iter().map(|(_, p)| p * p).sum();
     posterior

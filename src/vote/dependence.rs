@@ -1,32 +1,39 @@
 //! Dependence between vehicles: pairs that agree more often than their reliability explains.
 //!
-//! Honest vehicles agree because they see the same truth. If their votes depend on each other through the truth alone,
-//! the chance-corrected agreement κ of two vehicles is the product r_i · r_j of what each shares with the truth. This is
-//! the one-factor model of Spearman (1904), which needs no truth; κ is Cohen's (1960), with the cell's shares of labels
-//! as chance. More agreement means that one copies the other or that both err for the same reason (Dong, Berti-Équille
-//! & Srivastava 2009). ρ = (κ − r_i r_j) / (1 − r_i r_j) is the part of a vote that is not its own.
+//! Honest vehicles agree because they see the same truth. If their votes depend on each other
+//! through the truth alone, the chance-corrected agreement κ of two vehicles is the product r_i ·
+//! r_j of their agreements with the truth. This is the one-factor model of Spearman (1904), which
+//! needs no truth; κ is Cohen's (1960), with the cell's shares of labels as chance. More agreement
+//! means that one vehicle copies the other or that both err for the same reason (Dong,
+//! Berti-Équille & Srivastava 2009). ρ = (κ − r_i r_j) / (1 − r_i r_j) is the part of a vote that
+//! is not its own.
 //!
-//! Of two groups that contradict each other, either could be the honest one. The group of more *vehicles* is taken for
-//! it, however closely the others agree. That bounds the number of liars that are withstood at fewer than half.
+//! Of two groups that contradict each other, either could be the honest one. The group of more
+//! *vehicles* is assumed to be honest, however closely the others agree. The method therefore
+//! withstands malicious vehicles only if they are fewer than half.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
 
-/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost of a vote.
+/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost
+/// of a vote.
 const MAX_COMPARED: usize = 8;
-/// The same over stored votes.
+/// The same distance for stored votes.
 const MAX_COMPARED_STORED: usize = 32;
 /// Standard deviations by which agreement must exceed the expected agreement.
 const SIGNIFICANCE: f64 = 4.0;
-/// The same over stored votes, where many pairs are tested at once: one in 3 million exceeds it by chance.
+/// The same threshold for stored votes, where many pairs are tested at once: one in 3 million
+/// exceeds it by chance.
 const SIGNIFICANCE_STORED: f64 = 5.0;
-/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more influence.
+/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more
+/// influence.
 const SAME_GROUP: f64 = 0.3;
-/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as reliable as others.
+/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as
+/// reliable as others.
 const PRIOR_COMPARISONS: f64 = 10.0;
-/// Votes after which a vehicle has half of its final influence on the choice of the main group; bounds the gain of
-/// attackers who rejoin under new names.
+/// Votes after which a vehicle has half of its final influence on the choice of the main group;
+/// bounds the gain of attackers who rejoin under new names.
 const TENURE_VOTES: f64 = 50.0;
 const GROUPING_STEPS: u32 = 30;
 const FACTOR_STEPS: u32 = 15;
@@ -47,7 +54,7 @@ impl Pair {
         ((self.agreed - self.chance) / (self.compared - self.chance).max(1e-9)).clamp(-1.0, 1.0)
     }
 
-    /// The part ρ of a vote that is not its own, where κ = `explained` is expected of independent vehicles.
+    /// The dependent part ρ of a vote, where κ = `explained` is expected of independent vehicles.
     fn excess(&self, explained: f64, significance: f64) -> f64 {
         let expected = self.chance + (self.compared - self.chance) * explained;
         let deviation = (expected * (1.0 - expected / self.compared).max(0.0) + 1.0).sqrt();
@@ -70,7 +77,7 @@ pub(super) struct AgreementGroups {
     pub(super) dependent: usize,
 }
 
-/// Pairwise agreement of vehicles and what follows from it.
+/// Pairwise agreement of vehicles, and the resulting weights.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Dependence {
     /// Comparisons over which a pair's counts fade to 1/e.
@@ -101,12 +108,12 @@ impl Dependence {
         }
     }
 
-    /// Goes on with another memory.
+    /// Applies another memory.
     pub(super) fn configure(&mut self, memory: f64) {
         self.memory = memory;
     }
 
-    /// As [`Self::new`], for all stored votes together: nothing fades.
+    /// As [`Self::new`], for all stored votes together, without fading.
     pub(super) fn of_stored() -> Self {
         let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);
         Self {
@@ -117,7 +124,7 @@ impl Dependence {
         }
     }
 
-    /// Forgets vehicles, whose indices may be reused.
+    /// Removes vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         self.pairs
             .retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
@@ -136,7 +143,7 @@ impl Dependence {
         }
     }
 
-    /// Forgets how often labels were stated; their indices may be reused.
+    /// Clears how often labels were stated; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for &label in labels {
             let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else {
@@ -147,7 +154,8 @@ impl Dependence {
         }
     }
 
-    /// Compares the votes (vehicle, label, is new) on a landmark in pairs of which one is new; their order is fixed.
+    /// Compares the votes (vehicle, label, is new) on a landmark in pairs of which one is new;
+    /// their order is fixed.
     pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
         for &(vehicle, _, is_new) in votes {
             if self.tenure.len() <= vehicle {
@@ -197,8 +205,8 @@ impl Dependence {
         self.total += 1.0;
     }
 
-    /// Part of a vote that is the vehicle's own where the others that `agrees` selects state the same label: 1 / (1 +
-    /// Σ ρ), the design effect of correlated answers (Kish 1965).
+    /// Part of a vote that is the vehicle's own where the others that `agrees` selects state the
+    /// same label: 1 / (1 + Σ ρ), the design effect of correlated answers (Kish 1965).
     pub(super) fn independence(&self, vehicle: usize, agrees: impl Fn(usize) -> bool) -> f64 {
         let partners = self.partners.get(vehicle).map_or(&[][..], Vec::as_slice);
         let shared: f64 = partners
@@ -209,7 +217,7 @@ impl Dependence {
         1.0 / (1.0 + shared)
     }
 
-    /// Whether a fit is due: it then costs no more than the comparisons since the last one.
+    /// Whether a fit is due: it then costs at most as much as the comparisons since the last one.
     pub(super) fn is_due(&self) -> bool {
         self.compared >= self.pairs.len().max(64)
     }
@@ -261,8 +269,8 @@ impl Dependence {
     }
 }
 
-/// Membership of each vehicle, 0 to 1, in the largest group that agrees: a dominant set (Pavan & Pelillo 2007). It is
-/// found by power iteration that drops negative parts.
+/// Membership of each vehicle, 0 to 1, in the largest group that agrees: a dominant set (Pavan &
+/// Pelillo 2007). It is found by power iteration that drops negative parts.
 fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     let mut belonging = influences.to_vec();
     for _ in 0..GROUPING_STEPS {
@@ -296,8 +304,8 @@ fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
     (agreed / weights.max(1e-9)).clamp(0.0, 0.99)
 }
 
-/// One step of alternating least squares for κ = r_i · r_j. Agreement counts as far as it is with the main group and not
-/// excessive.
+/// One step of alternating least squares for κ = r_i · r_j. Agreement counts if it is with the main
+/// group and not excessive.
 fn next_factors(
     factors: &[f64],
     belonging: &[f64],

@@ -1,4 +1,4 @@
-//! The labels of a cell by index, and the choice of those that are evicted when room is short.
+//! The labels of a cell by index, and the choice of labels to evict when room is short.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,12 +15,13 @@ const SUPPORTED_VOTES: f64 = 1.0;
 #[derive(Debug, Clone)]
 struct LabelEntry {
     name: Label,
-    /// The vehicle that stated it first, while that is known.
+    /// The vehicle that stated the label first; `None` once that vehicle was removed.
     introduced_by: Option<usize>,
     stated_at: Option<Timestamp>,
 }
 
-/// Labels, numbered in order of first appearance; a label that leaves makes its index free for another.
+/// Labels, numbered in order of first appearance; a label that leaves makes its index free for
+/// another.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LabelTable {
     entries: Vec<LabelEntry>,
@@ -42,12 +43,13 @@ impl LabelTable {
         self.indices.get(label).copied()
     }
 
-    /// Whether a label is known or one more keeps to `max_labels`.
+    /// Whether a label is in the table, or one more label is within `max_labels`.
     pub(super) fn has_room_for(&self, label: &Label, max_labels: usize) -> bool {
         self.indices.len() < max_labels || self.indices.contains_key(label)
     }
 
-    /// The index of a label, a new or free one if it has none; `stated` is the vehicle that stated it and when.
+    /// The index of a label; a new or reused index if the label has none. `stated` is the vehicle
+    /// that stated it and the time.
     pub(super) fn intern(
         &mut self,
         label: &Label,
@@ -75,17 +77,19 @@ impl LabelTable {
         index
     }
 
-    /// Forgets which labels these vehicles stated first: their indices may be reused.
+    /// Clears which labels these vehicles stated first: their indices may be reused.
     pub(super) fn forget_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         for entry in &mut self.entries {
             entry.introduced_by = entry.introduced_by.filter(|by| !vehicles.contains(by));
         }
     }
 
-    /// Evicts the least useful labels and returns their indices; `support` is the number of correct votes of each.
+    /// Evicts the least useful labels and returns their indices; `support` is the number of correct
+    /// votes of each.
     ///
-    /// Unsupported labels go first, of these the labels of the vehicle that introduced most (longest queue drop, as in
-    /// fair queueing, McKenney 1990), the longest unseen first. A vehicle that invents labels loses its own.
+    /// Unsupported labels are evicted first. Among these, the labels of the vehicle that introduced
+    /// most are evicted first (longest queue drop, as in fair queueing, McKenney 1990), the longest
+    /// unseen first. A vehicle that invents labels therefore loses its own labels.
     pub(super) fn make_room(&mut self, support: &[f64]) -> BTreeSet<LabelIndex> {
         let is_supported = |index: LabelIndex| support[usize::from(index)] >= SUPPORTED_VOTES;
         let mut latest: Vec<_> = self

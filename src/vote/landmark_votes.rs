@@ -8,12 +8,12 @@ use super::dependence::Dependence;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
 
-/// Independent part of a vehicle's statements: one frame is much like the next.
+/// Independent part of a vehicle's statements, because consecutive frames are similar.
 const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
 /// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
 const NORMAL_TO_LOGISTIC: f64 = 0.8;
 
-/// A vote that counts at present.
+/// A vote that currently counts.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StoredVote {
     pub(super) vehicle: usize,
@@ -26,20 +26,21 @@ pub(super) struct StoredVote {
     /// Part of the weight that does not depend on other vehicles, 0 to 1.
     pub(super) independence: f64,
     pub(super) at: Timestamp,
-    /// When it began to count once more as evidence.
+    /// Time since which it counts again as evidence.
     pub(super) since: Timestamp,
     /// Rank of its confidence as of the last judgement.
     pub(super) band: usize,
-    /// Probability that the others give its label, while the live evidence on confidences contains it.
+    /// Probability that the others assign to its label, while the live evidence on confidences
+    /// contains it.
     pub(super) agreement: Option<f64>,
-    /// Whether the posterior rests on it.
+    /// Whether the posterior includes it.
     pub(super) judged: bool,
     /// Whether it has been compared with the other vehicles' votes since it began to count.
     pub(super) compared: bool,
 }
 
-/// The latest statements of one vehicle on one landmark: the fading weight of its votes for each label. A single frame
-/// that shows a wrong label does not change the vehicle's vote.
+/// The latest statements of one vehicle on one landmark: the fading weight of its votes for each
+/// label. A single frame that shows a wrong label does not change the vehicle's vote.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct RecentStatements {
     labels: [(LabelIndex, f64); 3],
@@ -48,7 +49,8 @@ pub(super) struct RecentStatements {
 }
 
 impl RecentStatements {
-    /// Adds a statement of `weight` after earlier ones faded by the factor `kept`; returns the label stated most.
+    /// Adds a statement of `weight` after earlier ones faded by the factor `kept`; returns the
+    /// label stated most.
     pub(super) fn add(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
         self.statements = self.statements * kept + 1.0;
         self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
@@ -69,7 +71,7 @@ impl RecentStatements {
         more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
     }
 
-    /// Forgets statements of labels whose indices may be reused.
+    /// Removes statements of labels whose indices may be reused.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
         self.labels
             .iter_mut()
@@ -77,9 +79,9 @@ impl RecentStatements {
             .for_each(|place| *place = (0, 0.0));
     }
 
-    /// Certainty, 0 to 1, that the label stated most is not so by chance: the lead over the next label in standard
-    /// deviations of a multinomial draw, as a two-sided probability. A vehicle that wavers between two labels hardly
-    /// votes.
+    /// Certainty, 0 to 1, that the most stated label is not due to chance: the lead over the next
+    /// label in standard deviations of a multinomial draw, as a two-sided probability. A vehicle
+    /// that alternates between two labels has almost no vote.
     pub(super) fn certainty(&self) -> f64 {
         let mut sums = self.labels.map(|(_, sum)| sum);
         sums.sort_by(f64::total_cmp);
@@ -103,13 +105,13 @@ impl StoredVote {
     }
 }
 
-/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
+/// The votes on one landmark, at most one per vehicle, in order of vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LandmarkVotes {
     pub(super) votes: Vec<StoredVote>,
     /// Probability of each label as of the last judgement.
     pub(super) posterior: Posterior,
-    /// Whether the live evidence contains votes and posterior at present.
+    /// Whether the live evidence currently contains votes and posterior.
     pub(super) counted: bool,
     /// The label of the verdict.
     pub(super) published: Option<LabelIndex>,
@@ -131,8 +133,8 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Counts new votes as evidence on dependence and on confidences; where there are many voters, `order` decides which
-    /// pairs are compared.
+    /// Counts new votes as evidence on dependence and on confidences; where there are many voters,
+    /// `order` decides which pairs are compared.
     pub(super) fn compare(
         &mut self,
         dependence: &mut Dependence,
@@ -186,7 +188,8 @@ impl LandmarkVotes {
         }
     }
 
-    /// Takes a judgement, and adds to the evidence on confidences how probable the others make the label of each vote.
+    /// Stores an evaluation, and adds to the evidence on confidences how probable the others make
+    /// the label of each vote.
     pub(super) fn take(
         &mut self,
         judged: LandmarkPosterior,
@@ -217,7 +220,8 @@ impl LandmarkVotes {
         }
     }
 
-    /// Share of each label in the weighted votes; equal shares where all voters waver, so that no vote has weight.
+    /// Share of each label in the weighted votes; equal shares if all voters alternate, so that
+    /// their votes have no weight.
     pub(super) fn majority(&self) -> Posterior {
         let total: f64 = self.votes.iter().map(|c| c.weight * c.independence).sum();
         let candidates = self.candidates();
@@ -235,7 +239,8 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Forgets labels with the votes for them; returns the number of votes. Not allowed while it is counted.
+    /// Removes labels with the votes for them; returns the number of votes. Not allowed while they
+    /// are counted.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
         let votes = self.votes.len();
         self.votes.retain(|vote| !is_gone(vote.label));
@@ -250,7 +255,7 @@ impl LandmarkVotes {
         votes - self.votes.len()
     }
 
-    /// Whether several vehicles voted and can thus judge each other.
+    /// Whether several vehicles voted, so that they can be compared with each other.
     pub(super) fn has_several_voters(&self) -> bool {
         self.votes.len() > 1
     }

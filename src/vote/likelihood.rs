@@ -2,7 +2,7 @@
 
 use super::confusion::LabelIndex;
 
-/// A vote as the model takes it.
+/// A vote in the form for the model.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct WeightedVote {
     /// Index of the vehicle.
@@ -18,7 +18,7 @@ pub(super) struct WeightedVote {
 /// Probabilities of labels.
 pub(super) type Posterior = Vec<(LabelIndex, f64)>;
 
-/// Judgement of a landmark by all its votes.
+/// Evaluation of a landmark by all its votes.
 pub(super) struct LandmarkPosterior {
     pub(super) labels: Posterior,
     /// Probability of each vote's label given the other votes.
@@ -31,15 +31,16 @@ pub(super) struct LandmarkPosterior {
 pub(super) struct Likelihood {
     /// Probability that the vehicle states the vote's label.
     pub(super) stating: Vec<f64>,
-    /// Its logarithm, but at most as much as where the stated label is true: no vote counts against its own label.
-    /// Otherwise the model has a mirrored solution, in which the honest majority consists of consistent liars.
+    /// Its logarithm, but at most its value where the stated label is true, so that a vote does not
+    /// count against its own label. Otherwise the model has a mirrored solution, in which the
+    /// honest majority counts as consistently wrong.
     pub(super) logs: Vec<f64>,
     /// The logarithm where the stated label is true.
     own_log: f64,
 }
 
 impl Likelihood {
-    /// From the probabilities by candidate; the vote's label is one of the candidates.
+    /// Created from the probabilities by candidate; the vote's label is one of the candidates.
     pub(super) fn new(vote: &WeightedVote, candidates: &[LabelIndex], stating: Vec<f64>) -> Self {
         let own = candidates
             .iter()
@@ -72,7 +73,7 @@ impl Likelihood {
     }
 }
 
-/// Makes the sum 1; returns false, with nothing changed, where it is 0.
+/// Scales the sum to 1; returns false, without a change, if the sum is 0.
 pub(super) fn normalise(posterior: &mut [(LabelIndex, f64)]) -> bool {
     let total: f64 = posterior.iter().map(|(_, p)| p).sum();
     if total > 0.0 {
@@ -81,7 +82,7 @@ pub(super) fn normalise(posterior: &mut [(LabelIndex, f64)]) -> bool {
     total > 0.0
 }
 
-/// Probability of a label; 0 for one that is not listed.
+/// Probability of a label; 0 for a label that is not listed.
 pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
     posterior
         .iter()

@@ -1,4 +1,4 @@
-//! A method that turns votes into verdicts, and what all methods share.
+//! The interface of voting methods, which turn votes into verdicts, and their common types.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,46 +15,50 @@ pub(super) struct NewVote<'a> {
     pub(super) node: &'a NodeName,
     pub(super) label: &'a Label,
     pub(super) confidence: f64,
-    /// Distance in metres and bearing in radians of the landmark, where the vehicle's pose is known.
+    /// Distance in metres and bearing in radians of the landmark, if the vehicle's pose is
+    /// available.
     pub(super) range_bearing: Option<(f64, f64)>,
     pub(super) at: Timestamp,
 }
 
-/// A voting method. What a method does without keeps the default, which does nothing.
+/// A voting method. The default methods do nothing, for steps that a method does not need.
 pub(super) trait VotingMethod {
-    /// Goes on under other settings of the same mode.
+    /// Applies other settings of the same mode.
     fn configure(&mut self, config: &VoteConfig);
 
-    /// Makes a landmark known, so that it has a verdict even without votes.
+    /// Adds a landmark, so that it has a verdict even without votes.
     fn add_landmark(&mut self, landmark: LandmarkId);
 
-    /// Forgets a landmark.
+    /// Removes a landmark.
     fn remove_landmark(&mut self, landmark: &LandmarkId);
 
-    /// Forgets vehicles.
+    /// Removes vehicles.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>);
 
-    /// Makes room for the label of a vote; returns how many votes were forgotten for it, `None` if there is no room.
+    /// Makes room for the label of a vote; returns the number of votes dropped for it, or `None` if
+    /// there is no room.
     fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize>;
 
     /// Counts a vote.
     fn add_vote(&mut self, vote: &NewVote<'_>);
 
-    /// Ends a round: returns the landmarks with news and the votes that are now known to be right or wrong.
+    /// Ends a round: returns the landmarks with news and the votes that have turned out to be right
+    /// or wrong.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>);
 
     /// The verdict at a landmark.
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict>;
 
-    /// The labels of the present votes on a landmark, and their vehicles.
+    /// The labels of the current votes on a landmark, and their vehicles.
     fn readings(&self, _landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
         BTreeMap::new()
     }
 
-    /// The trust in each vehicle.
+    /// The reputation of each vehicle.
     fn reputations(&self) -> BTreeMap<NodeName, Reputation>;
 
-    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
+    /// Whether a vehicle has voted often enough to be evaluated, and was right more often than
+    /// wrong.
     fn is_proven(&self, _node: &NodeName) -> bool {
         false
     }
@@ -80,7 +84,8 @@ pub(super) trait VotingMethod {
     fn resume(&mut self, _reputations: &BTreeMap<NodeName, Reputation>) {}
 }
 
-/// A verdict with `published` or else the label of the highest score, the first in alphabetical order on a tie.
+/// A verdict with `published` or, if absent, the label of the highest score, the first in
+/// alphabetical order on a tie.
 ///
 /// With hysteresis the published label may not be the highest for a while; its margin is 0 then.
 pub(super) fn verdict(

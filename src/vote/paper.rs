@@ -1,6 +1,7 @@
-//! The paper's voting, to the letter.
+//! The paper's voting without changes.
 //!
-//! S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), never cleared; λ_ρ = argmax_l S(ρ,l); r_v += Δr_v after each verdict.
+//! S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), without clearing; the label is λ_ρ = argmax_l S(ρ,l);
+//! r_v += Δr_v after each verdict.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,10 +15,11 @@ use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
 use crate::wire::{Reputation, Verdict};
 
-/// Lowest and highest reputation: `cap(…, 30, 100)` read as percent, applied to r_v after the change was added.
+/// Lowest and highest reputation: `cap(…, 30, 100)` read as percent, applied to r_v after the
+/// change was added.
 ///
-/// The paper prints the cap on Δr_v: every verdict would add at least 30 to a reputation that starts at 0.5. Its text
-/// says that the *scores* remain between 30 and 100.
+/// The paper prints the cap on Δr_v, in which case every verdict would add at least 30 to a
+/// reputation that starts at 0.5. Its text states that the *scores* remain between 30 and 100.
 pub const REPUTATION_RANGE: (f64, f64) = (0.30, 1.00);
 
 #[derive(Debug, Clone)]
@@ -31,7 +33,7 @@ struct VehicleScore {
 struct LandmarkScores {
     scores: BTreeMap<Label, f64>,
     contributors: BTreeSet<NodeName>,
-    /// Whether it was voted on in this round.
+    /// Whether it has votes in this round.
     has_new_votes: bool,
 }
 
@@ -39,7 +41,7 @@ struct LandmarkScores {
 #[derive(Debug, Clone)]
 pub(super) struct PaperVoting {
     config: PaperConfig,
-    /// By hash, as their order does not matter: a vote is on one of many.
+    /// Hashed, because the order is irrelevant: a vote concerns one of many landmarks.
     landmarks: HashMap<LandmarkId, LandmarkScores>,
     vehicles: BTreeMap<NodeName, VehicleScore>,
     changed: Vec<LandmarkId>,
@@ -85,7 +87,7 @@ impl VotingMethod for PaperVoting {
         self.landmarks.remove(landmark);
     }
 
-    /// Forgets reputations and names; the votes stay in the sums.
+    /// Removes reputations and names; the votes remain in the sums.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));
         self.landmarks
@@ -118,8 +120,8 @@ impl VotingMethod for PaperVoting {
         }
     }
 
-    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects over its votes since
-    /// the last verdict.
+    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects
+    /// over its votes since the last verdict.
     fn close(&mut self, _now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         let changed = std::mem::take(&mut self.changed);
         let mut labels: HashMap<&LandmarkId, Option<Label>> = HashMap::with_capacity(changed.len());
@@ -169,7 +171,7 @@ impl VotingMethod for PaperVoting {
             .collect()
     }
 
-    /// Reputations of vehicles that are not named stay.
+    /// Reputations of vehicles that are not listed are kept.
     fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         let (low, high) = REPUTATION_RANGE;
         for (node, reputation) in reputations {

@@ -4,7 +4,8 @@ use std::f64::consts::{LN_2, TAU};
 
 use super::config::{PaperConfig, WeightedConfig};
 
-/// The paper's visibility k(ρ,v) = p_d (1 − d/d_max) + (1 − p_d) θ/360°. As printed it *grows* off-axis.
+/// The paper's visibility k(ρ,v) = p_d (1 − d/d_max) + (1 − p_d) θ/360°. As printed it *grows*
+/// off-axis.
 ///
 /// `angle_rad` is the deviation θ from the camera's axis; its sign is ignored.
 pub fn paper(config: &PaperConfig, distance_m: f64, angle_rad: f64) -> f64 {
@@ -12,7 +13,8 @@ pub fn paper(config: &PaperConfig, distance_m: f64, angle_rad: f64) -> f64 {
     p * (1.0 - distance_m / config.max_range_m) + (1.0 - p) * (angle_rad.abs() / TAU)
 }
 
-/// Visibility in 0 to 1 that falls with the squared distance and, as a Gaussian, with the angle off the axis.
+/// Visibility in 0 to 1 that falls with the squared distance and, as a Gaussian, with the angle off
+/// the axis.
 pub fn weighted(config: &WeightedConfig, distance_m: f64, angle_rad: f64) -> f64 {
     let distance = (distance_m / config.max_range_m).clamp(0.0, 1.0);
     let angle = angle_rad / config.half_visibility_rad;

@@ -1,4 +1,4 @@
-//! The default voting: learned reputation × calibrated confidence × visibility.
+//! The default voting: estimated reputation × calibrated confidence × visibility.
 
 mod batch;
 mod eviction;
@@ -26,11 +26,11 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{ForeignVotes, Reputation, Verdict};
 
-/// Least weight of a statement among the vehicle's own.
+/// Minimum weight of a statement among the vehicle's own statements.
 const MIN_WEIGHT: f64 = 0.01;
-/// Share of the present vehicles from which dependent ones can have decided verdicts.
+/// Share of dependent vehicles among the present ones from which they may have decided verdicts.
 const MANY_DEPENDENT: f64 = 0.2;
-/// Times that all landmarks are judged in turn where learning starts again.
+/// Number of times that all landmarks are evaluated in turn when learning starts again.
 const START_SWEEPS: u32 = 3;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
@@ -44,7 +44,7 @@ pub(super) struct WeightedVoting {
     vehicles: BTreeMap<NodeName, usize>,
     /// By index of the vehicle.
     names: Vec<NodeName>,
-    /// Indices of forgotten vehicles.
+    /// Indices of removed vehicles.
     free: Vec<usize>,
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
@@ -52,16 +52,16 @@ pub(super) struct WeightedVoting {
     foreign: BTreeMap<NodeName, ForeignVotes>,
     labels: LabelTable,
     landmarks: BTreeMap<LandmarkId, LandmarkVotes>,
-    /// Landmarks to judge when the round closes.
+    /// Landmarks to evaluate when the round closes.
     changed: BTreeSet<LandmarkId>,
     /// The next expiry of each landmark that has votes.
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
-    /// The landmark that was judged again last.
+    /// The landmark that was re-evaluated last.
     revisit_after: Option<LandmarkId>,
     /// Votes since the last round.
     fresh_votes: usize,
     evidence: Vec<Evidence>,
-    /// Votes from then on become evidence.
+    /// Time from which on votes become evidence.
     recorded_from: Timestamp,
     /// Number of dependent vehicles when learning last started again because of them.
     known_dependent: usize,
@@ -82,7 +82,7 @@ impl WeightedVoting {
         Duration::from_secs_f64(self.config.freshness_s)
     }
 
-    /// The index of a vehicle, a new or free one if it has none.
+    /// The index of a vehicle; a new or reused index if the vehicle has none.
     fn vehicle(&mut self, node: &NodeName) -> usize {
         if let Some(&vehicle) = self.vehicles.get(node) {
             return vehicle;
@@ -101,7 +101,7 @@ impl WeightedVoting {
         vehicle
     }
 
-    /// Judges a landmark's votes from scratch.
+    /// Evaluates a landmark's votes from scratch.
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
@@ -132,9 +132,10 @@ impl WeightedVoting {
 
     /// Finds the vehicles that depend on each other.
     ///
-    /// If the main group is thought wrong more often than right and its copies right, then verdicts that the copies
-    /// made themselves taught that. Such evidence is void: learning starts again. It also does where many vehicles turn out
-    /// to be dependent, whose agreement has passed for reliability.
+    /// If the main group counts as wrong more often than right and its copies as right, this was
+    /// derived from verdicts that the copies themselves decided. Such evidence is void, and
+    /// learning starts again. Learning also starts again if many vehicles turn out to be dependent,
+    /// because their agreement was mistaken for reliability.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
         self.landmarks
@@ -161,8 +162,8 @@ impl WeightedVoting {
         }
     }
 
-    /// Judges older landmarks in turn, as far as the budget for this round's fresh votes goes; adds those whose
-    /// published label changed to `changed`.
+    /// Re-evaluates older landmarks in turn, within the budget for this round's fresh votes; adds
+    /// those whose published label changed to `changed`.
     fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
         let mut budget =
             (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
@@ -214,7 +215,7 @@ impl VotingMethod for WeightedVoting {
         self.landmarks.entry(landmark).or_default();
     }
 
-    /// Keeps what its votes taught.
+    /// The results of the landmark's votes are kept.
     fn remove_landmark(&mut self, landmark: &LandmarkId) {
         self.remove_votes(landmark, |_| true);
         if let Some(due) = self
@@ -227,7 +228,7 @@ impl VotingMethod for WeightedVoting {
         self.changed.remove(landmark);
     }
 
-    /// Forgets their votes and all evidence about them; other vehicles take their indices.
+    /// Removes the vehicles' votes and all evidence about them; other vehicles reuse their indices.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.evict_vehicles(nodes);
     }
@@ -236,7 +237,7 @@ impl VotingMethod for WeightedVoting {
         Some(self.evict_labels_for(vote.label, max_labels))
     }
 
-    /// Takes a vote in the place of the vehicle's earlier one on the landmark.
+    /// Adds a vote in place of the vehicle's earlier vote on the landmark.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
         let &NewVote {
             landmark,
@@ -334,7 +335,7 @@ impl VotingMethod for WeightedVoting {
         self.fresh_votes += 1;
     }
 
-    /// Judges the landmarks that changed, then some older ones in turn.
+    /// Evaluates the landmarks that changed, then some older landmarks in turn.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         self.expire(now);
         if self.dependence.is_due() {

@@ -10,7 +10,7 @@ use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
-/// A cell's map for those outside of the cell.
+/// A cell's map for receivers outside of the cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct CellMap {
     /// Major version of the payload, [`super::SCHEMA_VERSION`].
@@ -19,7 +19,8 @@ pub struct CellMap {
     /// The cell; equals the level of the topic.
     #[n(1)]
     pub cell: NodeName,
-    /// When it was sent, by the sender's own clock. Receivers judge age by how long messages of this cell take at least.
+    /// Time of sending by the sender's own clock. Receivers derive the age of a message from the
+    /// minimum transit time of this cell's messages.
     #[n(2)]
     pub sent_at_us: Timestamp,
     /// The place on Earth of the map's frame.
@@ -33,13 +34,13 @@ pub struct CellMap {
 /// An object of a neighbouring cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NeighbourObject {
-    /// The cell whose map has it.
+    /// The cell whose map contains the object.
     #[n(0)]
     pub cell: NodeName,
-    /// Time in seconds since the neighbour's map was fused, as far as it is known.
+    /// Estimated time in seconds since the neighbour's map was fused.
     #[cbor(n(1), with = "Half")]
     pub age_s: f64,
-    /// The object as that map has it, in this cell's frame.
+    /// The object in that map, converted to this cell's frame.
     #[n(2)]
     pub object: FusedObject,
 }

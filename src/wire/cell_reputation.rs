@@ -1,4 +1,4 @@
-//! Messages of cells to each other about vehicles.
+//! Messages that cells send to each other about vehicles.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
@@ -8,7 +8,8 @@ use super::compact::{Form, Half};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// A cell's own evidence about one vehicle, for other cells. Receivers keep the larger of every count.
+/// A cell's own evidence about one vehicle, for other cells. Receivers keep the larger of every
+/// count.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct CellReputation {
     /// Major version of the payload, [`super::SCHEMA_VERSION`].
@@ -17,28 +18,29 @@ pub struct CellReputation {
     /// The cell that counted; equals the last level of the topic.
     #[n(1)]
     pub cell: NodeName,
-    /// The vehicle; equals the level of the topic before.
+    /// The vehicle; equals the second-last level of the topic.
     #[n(2)]
     pub vehicle: NodeName,
     /// Number of votes in all leaderships that agreed with the verdict.
     #[n(3)]
     pub correct: u64,
-    /// Number of votes that did not.
+    /// Number of votes that disagreed.
     #[n(4)]
     pub incorrect: u64,
-    /// Number of the votes that agreed and are older than those that the cell remembers.
+    /// Number of the votes that agreed and that the cell has already dropped.
     #[n(5)]
     pub old_correct: u64,
-    /// Number of such votes that did not agree.
+    /// Number of such votes that disagreed.
     #[n(6)]
     pub old_incorrect: u64,
-    /// Time of the last reset of the cell's evidence; absent if there was none. Counts from before do not count.
+    /// Time of the last reset of the cell's evidence; absent without a reset. Earlier counts are
+    /// invalid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub reset_at_us: Option<Timestamp>,
 }
 
-/// Votes of other cells about a vehicle at the weight that they have here. They are not whole numbers.
+/// Votes of other cells about a vehicle with their weight in this cell. They are not whole numbers.
 #[derive(
     Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]

@@ -1,11 +1,12 @@
-//! Refusals that a node's broker shows to the programs beside it.
+//! Refusals that a node's broker shows to its local programs.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::model::names::NodeName;
 
-/// Messages of programs that a node's broker refused. Retained on `nodes/<node>/clients`, at that broker alone.
+/// Messages of programs that a node's broker refused. Retained on `nodes/<node>/clients`, only at
+/// that broker.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ClientRefusals {
     /// Major version of the payload, [`SCHEMA_VERSION`](crate::wire::SCHEMA_VERSION).
@@ -21,7 +22,7 @@ pub struct ClientRefusals {
 pub struct ClientRefusal {
     /// The client's MQTT identifier.
     pub client: String,
-    /// The reason by which refusals are counted, such as `not_permitted`.
+    /// The reason under which refusals are counted, such as `not_permitted`.
     pub reason: String,
     /// Topic of the last message.
     pub topic: String,

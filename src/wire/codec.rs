@@ -1,4 +1,4 @@
-//! JSON, CBOR and compact CBOR; the first byte tells them apart.
+//! JSON, CBOR and compact CBOR, which are distinguished by the first byte.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ use crate::model::names::NodeName;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Encoding {
-    /// Text that people and all languages can read; the default.
+    /// Text that people and all programming languages can read; the default.
     #[default]
     Json,
     /// RFC 8949 with the same field names.
@@ -22,10 +22,10 @@ pub enum Encoding {
     Compact,
 }
 
-/// Writes a payload.
+/// Encodes a payload.
 ///
 /// # Panics
-/// Never for the payloads of this crate: they serialise into memory.
+/// Does not panic for the payloads of this crate: they serialise into memory.
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
@@ -41,19 +41,20 @@ pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
-/// Reads any payload whose `schema` is known and checks every value in it. Entries that are not valid are left out;
-/// [`decode_entries`] returns them.
+/// Decodes any payload of a supported `schema` and checks every value in it. Invalid entries are
+/// left out; [`decode_entries`] returns them.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
     decode_entries(bytes, limits).map(|(payload, _)| payload)
 }
 
-/// Reads and checks a payload as [`decode`] does, and returns with it the entries that were left out.
+/// Decodes and checks a payload as [`decode`] does, and also returns the entries that were left
+/// out.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_entries<T: Payload>(
     bytes: &[u8],
     limits: &Limits,
@@ -73,10 +74,10 @@ pub fn decode_entries<T: Payload>(
     Ok((payload, invalid))
 }
 
-/// Reads a report and checks every value in it; `topic_node` is the node named by its topic.
+/// Decodes a report and checks every value in it; `topic_node` is the node named by its topic.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_report(
     bytes: &[u8],
     topic_node: &NodeName,
@@ -87,10 +88,10 @@ pub fn decode_report(
     })
 }
 
-/// Reads a share and checks every value in it; `topic_node` is the node named by its topic.
+/// Decodes a share and checks every value in it; `topic_node` is the node named by its topic.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_share(
     bytes: &[u8],
     topic_node: &NodeName,
@@ -154,7 +155,8 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     }
 }
 
-/// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
+/// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not
+/// finite.
 fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes
         .split(|byte| *byte == b'\n')
@@ -198,7 +200,7 @@ mod tests {
         }
     }
 
-    /// The reason for which a report is rejected, the same in all encodings.
+    /// The reason for which a report is rejected; it is equal in all encodings.
     fn reason(report: &ObjectReport) -> Option<RejectReason> {
         let cbor =
             decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
@@ -213,7 +215,7 @@ mod tests {
             .objects
             .iter()
             .all(|o| o.x_m.is_finite() && o.confidence.is_finite());
-        // JSON has no word for a number that is none.
+        // JSON cannot represent NaN and infinities.
         if finite
             && report.pose.is_none_or(|pose| {
                 pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite)

@@ -1,8 +1,9 @@
 //! The compact encoding: CBOR with structs as arrays and with rounded numbers of few bytes.
 //!
-//! The number `n` at a field of a payload is its index in the array. An index never changes its meaning; new fields are
-//! appended. An absent field is null, or left out at the end; readers skip unknown indices. Readers take every number as
-//! an integer or a float of any width; its [`Form`] decides how it is written.
+//! The number `n` at a field of a payload is its index in the array. The meaning of an index is
+//! fixed; new fields are appended. An absent field is null, or left out at the end; readers skip
+//! unknown indices. Readers take every number as an integer or a float of any width; its [`Form`]
+//! decides how it is written.
 
 mod number;
 
@@ -20,13 +21,13 @@ use super::RejectReason;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// True if the first byte of a payload is that of a compact one: an array, where JSON and CBOR with names have a map.
+/// True if the first byte of a payload starts a compact payload: an array. JSON and CBOR with names
+/// start with a map.
 pub(super) fn is_compact(first: u8) -> bool {
     const ARRAY: u8 = 4;
     first >> 5 == ARRAY
 }
 
-/// Writes a payload.
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub(super) fn write<T: Encode<()>>(payload: &T, bytes: &mut Vec<u8>) {
     minicbor::encode(payload, bytes).expect("payloads are written into memory");
@@ -43,14 +44,15 @@ pub(super) fn read<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectR
     }
 }
 
-/// The `schema` of a payload that may be of a later version: it stays the first.
+/// The `schema` of a payload that may be of a later version; it is always the first field.
 pub(super) fn schema(bytes: &[u8]) -> Option<u32> {
     let mut decoder = Decoder::new(bytes);
     decoder.array().ok()?;
     decoder.u32().ok()
 }
 
-/// A written form of values of type `T`, for types with several forms or without one in minicbor.
+/// A written form of values of type `T`, for types with several forms or without a form in
+/// minicbor.
 pub(crate) trait Form<T> {
     fn encode<C, W: Write>(
         value: &T,

@@ -30,7 +30,7 @@ use crate::model::names::NodeName;
 #[schemars(with = "String", extend("pattern" = "^[0-9a-f]{64}$"))]
 pub struct ContentHash(#[cbor(n(0), with = "minicbor::bytes")] pub [u8; 32]);
 
-/// A text that is no [`ContentHash`].
+/// Error for a text that is not a [`ContentHash`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("a hash has 64 hexadecimal digits")]
 pub struct InvalidHash;
@@ -86,7 +86,8 @@ impl From<ContentHash> for String {
     }
 }
 
-/// Version and hash of a description. The later version counts; of two equal ones, the greater hash.
+/// Version and hash of a description. The later version wins; between equal versions, the greater
+/// hash.
 #[derive(
     Debug,
     Clone,
@@ -104,7 +105,7 @@ impl From<ContentHash> for String {
     JsonSchema,
 )]
 pub struct DescriptionStamp {
-    /// Counts up by one with every change; 0 without a description.
+    /// Increases by one with every change; 0 without a description.
     #[n(0)]
     pub version: u64,
     /// Hash of the content.
@@ -124,13 +125,13 @@ pub struct CellDescription {
     /// Major version of the payload, [`SCHEMA_VERSION`](crate::wire::SCHEMA_VERSION).
     #[n(0)]
     pub schema: u32,
-    /// Counts up by one with every change. In a program's request to its node: 0.
+    /// Increases by one with every change. In a program's request to its node: 0.
     #[n(1)]
     pub version: u64,
     /// SHA-256 of `set_by`, a line feed and `text`.
     #[n(2)]
     pub hash: ContentHash,
-    /// The node at which it was set, as that node says.
+    /// The node at which the description was set, according to that node.
     #[n(3)]
     pub set_by: NodeName,
     /// The settings, as TOML.

@@ -1,6 +1,6 @@
-//! Faults of a rejected payload, in words: the field and its fault.
+//! Faults of a rejected payload as text: the field and its fault.
 //!
-//! A payload that can be used is never looked at here.
+//! Usable payloads are not examined here.
 
 use std::fmt;
 
@@ -11,7 +11,7 @@ use super::codec::read;
 use super::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION};
 use crate::model::names::MAX_NAME_BYTES;
 
-/// The reason why a payload was rejected, with the field that is to blame.
+/// The reason why a payload was rejected, with the responsible field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Flaw {
     /// The reason.
@@ -23,7 +23,7 @@ pub struct Flaw {
 }
 
 impl Flaw {
-    /// A flaw of a field; without fault where there is none to tell.
+    /// A flaw of a field; `fault` is empty if there is no further information.
     pub fn new(reason: RejectReason, field: impl Into<String>, fault: impl Into<String>) -> Self {
         Self {
             reason,
@@ -62,7 +62,7 @@ impl Flaw {
         }
     }
 
-    /// The flaw of a report in JSON; `None` if it has none.
+    /// The flaw of a report in JSON; `None` if the report is valid.
     pub(crate) fn of_json(text: &[u8], reason: RejectReason, limits: &Limits) -> Option<Self> {
         let line = || serde_json::from_slice(text).unwrap_or_default();
         let report: ObjectReport = match read_json(text) {
@@ -76,10 +76,10 @@ impl Flaw {
         Some(Self::of_value(&line(), reason, field))
     }
 
-    /// The flaw of a value that is no valid one.
+    /// The flaw of an invalid value.
     fn of_value(payload: &Value, reason: RejectReason, field: String) -> Self {
         let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
-        // A key with a dot of its own is not found again.
+        // A key that contains a dot cannot be found again.
         let value = payload.pointer(&pointer);
         let shown = value.map_or_else(String::new, |value| format!(": {value}"));
         let fault = match reason {
@@ -90,7 +90,7 @@ impl Flaw {
             RejectReason::NotFinite if field.ends_with("covariance_m2") => {
                 format!("is no covariance{shown}")
             }
-            // JSON has no such number; other encodings do.
+            // JSON cannot represent this number; other encodings can.
             RejectReason::NotFinite if value.is_none_or(Value::is_null) => {
                 "is not a finite number".into()
             }
@@ -117,11 +117,11 @@ impl fmt::Display for Flaw {
 /// Reads JSON.
 ///
 /// # Errors
-/// The path of the value that cannot be read, and its fault.
+/// Returns the path of the value that cannot be read, and its fault.
 pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, String)> {
     let mut source = serde_json::Deserializer::from_slice(text);
     let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
-        // Beyond a broken name, the path is unknown.
+        // If a name is broken, the path behind it is unavailable.
         let path = error.path().to_string();
         (
             path.trim_matches(['.', '?']).to_owned(),
@@ -134,7 +134,7 @@ pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, 
     Ok(value)
 }
 
-/// The fault that a reader of JSON found.
+/// The fault reported by the JSON reader.
 fn fault(text: &[u8], error: &serde_json::Error) -> String {
     let text = text
         .split(|byte| *byte == b'\n')

@@ -18,7 +18,8 @@ pub struct LedgerShare {
     /// The sender; equals the last level of the topic.
     #[n(1)]
     pub node: NodeName,
-    /// Term in which the sender's leadership began, also after it renewed its term; absent when it does not lead.
+    /// Term in which the sender's leadership began, even after it renewed its term; absent when it
+    /// does not lead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(2)]
     pub epoch: Option<u64>,
@@ -29,31 +30,33 @@ pub struct LedgerShare {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(4), default)]
     pub marks: Vec<LedgerMark>,
-    /// Signature of the aggregator that counted, in cells with certificates; all counts and marks are then its own, of
-    /// one leadership.
+    /// Signature of the aggregator that counted, in cells with certificates; all counts and marks
+    /// must then be this aggregator's own, from one leadership.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub signed: Option<LedgerSignature>,
-    /// Time of the last reset of the cell's evidence, in cells without certificates; absent if there was none. Evidence
-    /// from before does not count.
+    /// Time of the last reset of the cell's evidence, in cells without certificates; absent without
+    /// a reset. Earlier evidence is invalid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(6)]
     pub reset_at_us: Option<Timestamp>,
 }
 
 impl LedgerShare {
-    /// The bytes that an aggregator signs: the compact encoding of `["ecod ledger 1", cell, entries, marks]`. Sender and
-    /// term are not among them, so that others can pass the counts on.
+    /// The bytes that an aggregator signs: the compact encoding of
+    /// `["ecod ledger 1", cell, entries, marks]`. Sender and term are not included, so that other
+    /// nodes can pass the counts on.
     ///
     /// # Panics
-    /// Never: it writes into memory.
+    /// Does not panic: it writes into memory.
     #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
     pub fn signed_bytes(&self, cell: &NodeName) -> Vec<u8> {
         let content = ("ecod ledger 1", cell, &self.entries, &self.marks);
         minicbor::to_vec(content).expect("shares are written into memory")
     }
 
-    /// The leadership whose counts these are. `None` without counts and marks, and for those of several leaderships.
+    /// The leadership to which these counts belong. `None` without counts and marks, and for counts
+    /// of several leaderships.
     pub fn lane(&self) -> Option<Epoch> {
         let entries = self
             .entries
@@ -66,19 +69,20 @@ impl LedgerShare {
             .then(|| Epoch::new(term, aggregator.clone()))
     }
 
-    /// True if it has neither counts nor marks.
+    /// True if there are no counts and no marks.
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty() && self.marks.is_empty()
     }
 }
 
-/// Signature under the counts of one leadership, and the certificate to verify it.
+/// Signature on the counts of one leadership, and the certificate to verify it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerSignature {
     /// The aggregator's X.509 certificate in DER, as base64.
     #[n(0)]
     pub certificate: String,
-    /// ECDSA signature (P-256, SHA-256) in DER of the cell's name, the counts and the marks, as base64.
+    /// ECDSA signature (P-256, SHA-256) in DER of the cell's name, the counts and the marks, as
+    /// base64.
     #[n(1)]
     pub signature: String,
 }
@@ -101,12 +105,13 @@ pub struct LedgerEntry {
     /// Number of votes that agreed with the verdict, since the leadership began.
     #[n(4)]
     pub correct: u64,
-    /// Number of votes that did not.
+    /// Number of votes that disagreed with the verdict.
     #[n(5)]
     pub incorrect: u64,
 }
 
-/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of votes; written once.
+/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of
+/// votes; written once.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerMark {
     /// Term of the leadership that counted.
@@ -118,13 +123,13 @@ pub struct LedgerMark {
     /// The vehicle.
     #[n(2)]
     pub node: NodeName,
-    /// Its number of votes then, divided by 32.
+    /// The vehicle's number of votes at that time, divided by 32.
     #[n(3)]
     pub number: u64,
-    /// Number of those that agreed with the verdict.
+    /// Number of votes that agreed with the verdict.
     #[n(4)]
     pub correct: u64,
-    /// Number of those that did not.
+    /// Number of votes that did not agree with the verdict.
     #[n(5)]
     pub incorrect: u64,
 }

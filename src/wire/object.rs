@@ -31,7 +31,7 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(4), with = "CovarianceForm", has_nil)]
     pub covariance_m2: Option<[f64; 3]>,
-    /// The known location to which the node assigns this object; required in VOTE.
+    /// The landmark to which the node assigns this object; required in VOTE.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(5), with = "Text", has_nil)]
     pub landmark: Option<LandmarkId>,
@@ -47,7 +47,7 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(8), with = "Half", has_nil)]
     pub size_m: Option<[f64; 2]>,
-    /// The detector's confidence in each class, 0 to 1, if it gives more than the best one.
+    /// The detector's confidence in each class, 0 to 1, if it provides more than the best one.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cbor(n(9), with = "Half", has_nil)]
     pub scores: BTreeMap<Label, f64>,
@@ -71,7 +71,8 @@ impl PerceivedObject {
     }
 }
 
-/// The field of view of a camera or scanner, from the pose of its report and centred on its heading.
+/// The field of view of a camera or scanner, from the pose of its report and centred on its
+/// heading.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FieldOfView {
     /// Range in metres within which objects are usually detected.
@@ -82,7 +83,7 @@ pub struct FieldOfView {
     pub angle_rad: f64,
 }
 
-/// An object at no known location, at the time of fusion.
+/// An object that is not at a landmark, at the time of fusion.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FusedObject {
     /// Stable identity of the object.
@@ -103,7 +104,7 @@ pub struct FusedObject {
     /// Position covariance `[xx, xy, yy]` in m².
     #[cbor(n(5), with = "CovarianceForm")]
     pub covariance_m2: [f64; 3],
-    /// The nodes whose detections are in the entry.
+    /// The nodes whose detections were used for the entry.
     #[n(6)]
     pub contributors: Vec<NodeName>,
     /// Probability that the object exists and is still there.
@@ -134,7 +135,7 @@ pub struct FusedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(12)]
     pub first_seen_us: Option<Timestamp>,
-    /// The node that this object is, by the node's own report.
+    /// The node whose vehicle this object is, by the node's own report.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(13)]
     pub vehicle: Option<NodeName>,
@@ -169,10 +170,12 @@ impl FusedObject {
 
 /// The estimated error of a vehicle's positions, from objects that several vehicles detect.
 ///
-/// A reported position p is corrected to R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
+/// A reported position p is corrected to R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`,
+/// `dy_m`).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PoseCorrection {
-    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of the vehicle's detections.
+    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of the
+    /// vehicle's detections.
     #[cbor(n(0), with = "Millimetres")]
     pub about_m: [f64; 2],
     /// East in metres.

@@ -1,4 +1,4 @@
-//! The topics of a region, on which cells tell of themselves by their place on Earth.
+//! The topics of a region, on which cells publish by their place on Earth.
 
 use crate::model::names::NodeName;
 use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
@@ -73,7 +73,7 @@ impl RegionTopic {
         }
     }
 
-    /// Content of a full topic; `None` for others.
+    /// Content of a full topic; `None` for other topics.
     pub fn parse(path: &str) -> Option<Self> {
         let rest = path.strip_prefix(ROOT)?.strip_prefix('/')?;
         let (rest, kind) = rest.rsplit_once('/')?;

@@ -5,7 +5,7 @@ use std::fmt;
 /// Defines the reasons together with their names in counters.
 macro_rules! reject_reasons {
     ($($(#[$doc:meta])* $reason:ident = $name:literal,)*) => {
-        /// The reason why a payload was not used; nothing has changed then.
+        /// The reason why a payload was not used. The state is unchanged in this case.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub enum RejectReason {
             $($(#[$doc])* $reason,)*
@@ -28,17 +28,18 @@ macro_rules! reject_reasons {
 reject_reasons! {
     /// More bytes than [`Limits`](super::Limits) allow.
     TooLarge = "too_large",
-    /// Neither JSON nor CBOR, truncated, not UTF-8, or without a required field.
+    /// Not valid JSON or CBOR, truncated, not UTF-8, or without a required field.
     Malformed = "malformed",
     /// A `schema` other than [`SCHEMA_VERSION`](super::SCHEMA_VERSION).
     UnknownSchema = "unknown_schema",
-    /// The payload's node is not the topic's.
+    /// The node in the payload differs from the node in the topic.
     NodeMismatch = "node_mismatch",
     /// More objects or seen landmarks than [`Limits::objects`](super::Limits::objects).
     TooManyObjects = "too_many_objects",
-    /// A number is NaN, infinite or out of the world's bounds, or a covariance is not one.
+    /// A number is NaN, infinite or out of the world's bounds, or a covariance is invalid.
     NotFinite = "not_finite",
-    /// An epoch, round, count or time beyond [`MAX_INTEGER`](super::MAX_INTEGER), or a score out of its bounds.
+    /// An epoch, round, count or time beyond [`MAX_INTEGER`](super::MAX_INTEGER), or a score out of
+    /// its bounds.
     OutOfRange = "out_of_range",
     /// A confidence outside 0 to 1.
     ConfidenceOutOfRange = "confidence_out_of_range",
@@ -58,26 +59,28 @@ reject_reasons! {
     UnknownTopic = "unknown_topic",
     /// From an aggregator or epoch that has been superseded.
     Superseded = "superseded",
-    /// From an aggregator that is not the elected one.
+    /// From an aggregator other than the elected one.
     NotElected = "not_elected",
     /// A report for an algorithm that the cell does not run.
     NotFused = "not_fused",
-    /// A payload without a signature of the cell, or evidence or a round without its aggregator's, where there must be one.
+    /// A payload without the cell's signature, or evidence or a round without its aggregator's
+    /// signature, where one is required.
     BadSignature = "bad_signature",
-    /// Evidence of a node that is not known as a candidate.
+    /// Evidence of a node that is not a registered candidate.
     NotCandidate = "not_candidate",
-    /// Evidence of a term that the election does not know yet.
+    /// Evidence of a term that the election has not seen yet.
     UnknownTerm = "unknown_term",
     /// Evidence of a leadership that its sender cannot vouch for.
     Unattested = "unattested",
     /// Evidence of more votes than there can have been.
     Implausible = "implausible",
-    /// A program's message at its node's broker in another name than the node's, or on a topic that programs only read.
+    /// A program's message at its node's broker under a name other than the node's, or on a topic
+    /// that is read-only for programs.
     NotPermitted = "not_permitted",
 }
 
 impl RejectReason {
-    /// The name in words.
+    /// The name as text.
     pub fn in_words(self) -> String {
         self.as_str().replace('_', " ")
     }

@@ -1,4 +1,4 @@
-//! The topics on which the cells of a region tell each other of vehicles.
+//! The topics on which the cells of a region exchange counts about vehicles.
 
 use crate::model::names::NodeName;
 
@@ -20,22 +20,22 @@ impl ReputationTopic {
         format!("{ROOT}/{}/{}", self.vehicle, self.cell)
     }
 
-    /// The filter for what all cells say of one vehicle.
+    /// The filter for all cells' counts about one vehicle.
     pub fn filter_of_vehicle(vehicle: &NodeName) -> String {
         format!("{ROOT}/{vehicle}/+")
     }
 
-    /// The filter for what one cell says of all vehicles.
+    /// The filter for one cell's counts about all vehicles.
     pub fn filter_of_cell(cell: &NodeName) -> String {
         format!("{ROOT}/+/{cell}")
     }
 
-    /// The filter for what all cells say of all vehicles.
+    /// The filter for all cells' counts about all vehicles.
     pub fn filter_everywhere() -> String {
         format!("{ROOT}/+/+")
     }
 
-    /// Content of a full topic; `None` for others.
+    /// Content of a full topic; `None` for other topics.
     pub fn parse(path: &str) -> Option<Self> {
         let (vehicle, cell) = path
             .strip_prefix(ROOT)?

@@ -27,7 +27,7 @@ pub enum Topic {
     Nodes(NodeName),
 }
 
-/// Algorithm that a report is for, told by the topic that it came on.
+/// Algorithm that a report is for, given by the topic on which it arrived.
 #[derive(
     Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
 )]
@@ -56,7 +56,7 @@ impl ReportKind {
     }
 }
 
-/// Builds and takes apart the topics below `ecod/v1/<cell>`.
+/// Builds and parses the topics below `ecod/v1/<cell>`.
 #[derive(Debug, Clone)]
 pub struct Topics {
     root: String,
@@ -75,7 +75,7 @@ impl Topics {
         format!("{}/{topic}", self.root)
     }
 
-    /// The topic on which a node's broker tells programs what it refused.
+    /// The topic on which a node's broker informs programs of refused messages.
     pub fn clients(&self, node: &NodeName) -> String {
         format!("{}/nodes/{node}/clients", self.root)
     }
@@ -90,7 +90,7 @@ impl Topics {
         format!("{}/{level}", self.root)
     }
 
-    /// Content of a full topic; `None` for one that is not of this cell.
+    /// Content of a full topic; `None` for a topic of another cell.
     pub fn parse(&self, path: &str) -> Option<Topic> {
         let level = path.strip_prefix(&self.root)?.strip_prefix('/')?;
         let (kind, node) = level

@@ -1,13 +1,13 @@
-//! Troubles that a node has or sees.
+//! Troubles that a node has or observes.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A present trouble, with cause and remedy in words for people.
+/// A current trouble, with cause and remedy as text for people.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Trouble {
-    /// Stable name of its kind, such as `clock_off`. Later versions may know further kinds.
+    /// Stable name of its kind, such as `clock_off`. Later versions may have further kinds.
     #[n(0)]
     pub kind: String,
     /// The vehicle, address or host that it is about; absent if it is about the node itself.
@@ -17,7 +17,7 @@ pub struct Trouble {
     /// The cause, with its figures.
     #[n(2)]
     pub cause: String,
-    /// What mends it.
+    /// The remedy as text.
     #[n(3)]
     pub remedy: String,
 }

@@ -18,7 +18,8 @@ use crate::model::names::{Label, NodeName, is_label, is_plain_text};
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
-/// Maximum length of the text of a cell's description in bytes; all vehicles get it with each connection to a broker.
+/// Maximum length of the text of a cell's description in bytes; all vehicles get it with each
+/// connection to a broker.
 pub const MAX_DESCRIPTION_BYTES: usize = 256 * 1024;
 
 /// Bounds of a payload; one beyond them is not decoded.
@@ -42,17 +43,19 @@ impl Default for Limits {
     }
 }
 
-/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC 8259, section 6).
+/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC
+/// 8259, section 6).
 pub const MAX_INTEGER: u64 = (1 << 53) - 1;
 
-/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need synchronised clocks;
-/// this only rejects rounds that would look fresh for hours.
+/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need
+/// synchronised clocks; this only rejects rounds that would look fresh for hours.
 pub const MAX_FUSED_AHEAD_S: u64 = 3600;
 
 /// Maximum length of a certificate or signature in base64, in bytes.
 const MAX_TEXT: usize = 4096;
 
-/// Maximum number of counts, and of marks, in one share: it stays below the default of [`Limits::payload_bytes`].
+/// Maximum number of counts, and of marks, in one share: it stays below the default of
+/// [`Limits::payload_bytes`].
 pub const MAX_SHARE_ENTRIES: usize = 512;
 
 /// Largest coordinate of a position on Earth in metres.
@@ -61,21 +64,23 @@ const WORLD_BOUND_M: f64 = 1e8;
 /// Fastest object in metres per second.
 const SPEED_BOUND_MPS: f64 = 1e4;
 
-/// Largest size of an object and largest range of a sensor in metres. A number of 11 significant bits: the compact
-/// encoding rounds no smaller size beyond it.
+/// Largest size of an object and largest range of a sensor in metres. A number of 11 significant
+/// bits: the compact encoding rounds no smaller size beyond it.
 const SIZE_BOUND_M: f64 = 102_400.0;
 
-/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], and little enough for sums and products
-/// of covariances to stay finite. A power of two, 7.4e19, which no encoding rounds up.
+/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], and little
+/// enough for sums and products of covariances to stay finite. A power of two, 7.4e19, which no
+/// encoding rounds up.
 const VARIANCE_BOUND_M2: f64 = (1u128 << 66) as f64;
 
-/// Largest age in seconds and largest number of pairs of detections; a power of two, which no encoding rounds up.
+/// Largest age in seconds and largest number of pairs of detections; a power of two, which no
+/// encoding rounds up.
 const COUNT_BOUND: f64 = (1u64 << 52) as f64;
 
 /// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
-/// Largest yaw rate of a frame: far more than that of any vehicle.
+/// Maximum yaw rate of a frame, far above any vehicle's yaw rate.
 const YAW_RATE_BOUND_RADPS: f64 = 100.0;
 
 /// Maximum number of classes with scores of one object.
@@ -94,8 +99,8 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
         limits.payload_bytes
     }
 
-    /// Removes the entries whose values are not valid, and returns what was removed. One bad entry of a map, of verdicts or
-    /// of reputations costs the others nothing.
+    /// Removes the entries with invalid values, and returns the removed entries. One bad entry of a
+    /// map, of verdicts or of reputations does not affect the other entries.
     fn remove_invalid(&mut self) -> Vec<InvalidEntry> {
         Vec::new()
     }
@@ -258,7 +263,7 @@ impl PerceivedObject {
 /// Checks that a time of fusion is less than [`MAX_FUSED_AHEAD_S`] ahead.
 ///
 /// # Errors
-/// [`RejectReason::FromTheFuture`].
+/// Returns [`RejectReason::FromTheFuture`].
 pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
     let ahead = fused_at.since(received_at);
     if ahead.as_secs() < MAX_FUSED_AHEAD_S {

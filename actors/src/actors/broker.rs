@@ -6,9 +6,10 @@
 //!    └─ EmbeddedBroker  a thread of its own; clients see only its socket
 //! ```
 //!
-//! A failed start is an answer to the caller, not a failure of the actor: the node decides what to do. A broker that has
-//! ended by itself, or hangs, ends the actor at the next query of its state, so that the node restarts both. A broker
-//! that hangs keeps its port. The node then ends, as only a new process can have the port again.
+//! A failed start is an answer to the caller, not a failure of the actor: the node decides what to
+//! do. A broker that has ended by itself, or hangs, ends the actor at the next query of its state,
+//! so that the node restarts both. A broker that hangs keeps its port. The node then ends, because
+//! only a new process can bind the port again.
 
 #![deny(clippy::indexing_slicing)]
 

@@ -7,8 +7,9 @@
 //! Gateway, Broker <── probe, every half second ─────────────────────┘
 //! ```
 //!
-//! The page shows the messages that its node accepted, so it follows the same aggregator. Nothing waits for the
-//! dashboard: it reads watches and counters, takes snapshots only for viewers, and skips those that a browser misses.
+//! The page shows the messages that its node accepted, so it follows the same aggregator. The
+//! dashboard does not hold up other actors: it reads watches and counters, takes snapshots only
+//! while there are viewers, and skips snapshots that a browser misses.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -29,7 +30,8 @@ pub struct DashboardArguments {
     pub config: DashboardConfig,
     /// Inputs from the node.
     pub sources: NodeSources,
-    /// Receives the bound address. A restarted dashboard binds the address that this already holds.
+    /// Receives the bound address. A restarted dashboard binds the address that this watch already
+    /// contains.
     pub bound: watch::Sender<Option<SocketAddr>>,
 }
 

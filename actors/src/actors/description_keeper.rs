@@ -1,4 +1,5 @@
-//! The actor that keeps the cell's description: takes, saves and passes on the newest.
+//! The actor that keeps the cell's description: it accepts, saves and distributes the newest
+//! version.
 //!
 //! ```text
 //! program ── door ── Set ──────────> DescriptionKeeper ── PublishDescription ──> Gateway
@@ -34,10 +35,10 @@ use crate::telemetry::counters::{Counters, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::pki::{Credentials, LoadedCredentials};
 
-/// The state that is saved here, in words.
+/// Name of the saved state in messages.
 const DESCRIPTION: &str = "description of the cell";
 
-/// Callback that has a node use a description. It must not block.
+/// Callback that makes a node use a description. It must not block.
 pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
 
 /// Parts and values that a keeper needs at its start.
@@ -46,13 +47,13 @@ pub struct DescriptionKeeperArguments {
     pub name: NodeName,
     /// True if it may lead, and so set and publish descriptions.
     pub may_lead: bool,
-    /// The description that the node uses, or knows and cannot use.
+    /// The description that the node uses, or has but cannot use.
     pub held: Option<Arc<CellDescription>>,
-    /// Where it is saved, if anywhere.
+    /// File in which it is saved, if any.
     pub file: Option<StateFile>,
     /// The node's certificates, with the revocation list.
     pub credentials: Option<Arc<Credentials>>,
-    /// Has the node use a description.
+    /// Makes the node use a description.
     pub apply: DescriptionSink,
     /// The other nodes.
     pub members: watch::Receiver<Vec<Member>>,
@@ -68,7 +69,7 @@ pub struct DescriptionKeeperArguments {
 #[derive(Debug, Default)]
 pub struct DescriptionKeeper;
 
-/// The exchange, and what the disk lacks.
+/// The exchange, and the state that is not on disk yet.
 pub struct DescriptionKeeperState {
     exchange: DescriptionExchange,
     name: NodeName,
@@ -83,7 +84,7 @@ pub struct DescriptionKeeperState {
     counters: Arc<Counters>,
 }
 
-/// Time between two looks at what others lack.
+/// Time between two checks for nodes that lack the description.
 const TICK: Duration = Duration::from_millis(500);
 
 const _: () = assert!(TICK.as_millis() < PUBLISH_INTERVAL.as_millis());
@@ -123,7 +124,7 @@ impl Actor for DescriptionKeeper {
         let history = saved.unwrap_or_else(|| DescriptionHistory::of(held.clone()));
         let mut writer = StateWriter::new(file, DESCRIPTION);
         if held.is_some() {
-            // One that the node was started with is not on the disk yet.
+            // A description with which the node was started is not on disk yet.
             writer.note_change();
         }
         Ok(DescriptionKeeperState {
@@ -201,7 +202,8 @@ impl Actor for DescriptionKeeper {
 }
 
 impl DescriptionKeeperState {
-    /// Takes a node's word. With certificates, one counts only beside its certificate, by which it can be revoked.
+    /// Processes a node's statement. With certificates, a statement counts only together with its
+    /// certificate, by which it can be revoked.
     fn hear(
         &mut self,
         from: &NodeName,
@@ -231,8 +233,8 @@ impl DescriptionKeeperState {
         )
     }
 
-    /// Goes back to the description before those of revoked nodes, when the list has changed. The last word of a node may
-    /// also come after the list.
+    /// Returns to the latest description that was not stated by revoked nodes, when the revocation
+    /// list has changed. A revoked node's last statement may also arrive after the list.
     fn drop_revoked(&mut self, has_adopted: bool, now: Timestamp) {
         let Some(loaded) = self
             .credentials

@@ -6,7 +6,8 @@
 //!                                         └── permit, when done ──┘
 //! ```
 //!
-//! The pump takes the latest frame only when the detector is done with the previous one, so frames never queue.
+//! The pump takes the latest frame only when the detector is done with the previous one, so frames
+//! never queue.
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -48,7 +49,7 @@ pub struct DetectorArguments {
     pub projector: ActorSlot<ProjectorMessage>,
     /// Records some of the frames.
     pub images: Option<ImageRecorder>,
-    /// Shows some of the frames, if they are shown at all.
+    /// Shows some of the frames, if the page shows the camera.
     pub camera_feed: Option<Arc<CameraFeed>>,
     /// Troubles of the camera.
     pub troubles: CameraTroubles,
@@ -58,7 +59,7 @@ pub struct DetectorArguments {
     pub spans: watch::Receiver<Spans>,
 }
 
-/// Runs the detection algorithm on the latest frame, again and again.
+/// Runs the detection algorithm repeatedly on the latest frame.
 #[derive(Debug, Default)]
 pub struct Detector;
 
@@ -80,7 +81,7 @@ pub struct DetectorState {
     readers: Readers,
 }
 
-/// Time after which a detector is told to be slow.
+/// Duration of one frame from which a detector is reported as slow.
 const SLOW_AFTER: Duration = Duration::from_secs(5);
 const SLOW_DETECTOR: &str = "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
 
@@ -202,7 +203,8 @@ impl Actor for Detector {
 }
 
 impl DetectorState {
-    /// The detections' lens, with them scaled to its image size; none for a frame of a shape that the lens does not take.
+    /// Scales detections to the image size of the lens. Returns the lens; `None` for a frame of a
+    /// shape that the lens does not accept.
     fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> Option<Lens> {
         let scaled = self.lens.fitted(frame, detections);
         let mismatch = scaled.as_ref().err().copied();
@@ -298,7 +300,7 @@ mod tests {
     use crate::camera::frame::CameraFrame;
     use crate::camera::frame_source::SourceConfig;
 
-    /// A model that is too large for its machine: each frame takes until the test says.
+    /// A model that is too large for its machine: each frame takes until the test releases it.
     struct Slow(Receiver<()>);
 
     impl Detect for Slow {

@@ -1,4 +1,4 @@
-//! The actor that takes the cell's maps, verdicts and reputations.
+//! The actor that accepts the cell's maps, verdicts and reputations.
 //!
 //! ```text
 //! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
@@ -7,8 +7,8 @@
 //!                                            └── everything accepted ──> Door ──> programs beside the node
 //! ```
 //!
-//! It owns the node's [`RoundFilter`], which decides by the leadership of the moment. So each map is judged where it
-//! arrives, without another hop and without a lock.
+//! It owns the node's [`RoundFilter`], which decides by the current leadership. Each map is
+//! therefore checked where it arrives, without another hop and without a lock.
 
 mod map_log;
 
@@ -40,26 +40,26 @@ use crate::transport::mqtt::Delivery;
 
 /// Arguments of a follower's start.
 pub struct FollowerArguments {
-    /// Gets the newest of everything.
+    /// Receives the newest map, verdicts and reputations.
     pub newest: Newest,
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
     /// The node's cell.
     pub cell: NodeName,
-    /// The cell in which its vehicle is present: maps of others are not logged.
+    /// The cell in which the vehicle is present: maps of other cells are not logged.
     pub present_cell: watch::Receiver<NodeName>,
-    /// Where everything accepted is recorded.
+    /// Records all accepted messages.
     pub recording: LogSender,
     /// The last term that an earlier run of the node wrote to disk.
     pub saved_term: u64,
     /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
-    /// Is told of the rounds taken.
+    /// Receives the accepted rounds.
     pub election: ActorSlot<LeaderElectionMessage>,
-    /// Goes on from the maps taken, when the node leads.
+    /// Continues from the accepted maps when the node leads.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Passes everything accepted on to programs.
+    /// Forwards all accepted messages to local programs.
     pub door: Door,
     /// The cell's time.
     pub clock: CellClock,
@@ -73,7 +73,7 @@ pub struct FollowerArguments {
 #[derive(Debug, Default)]
 pub struct Follower;
 
-/// The newest of everything and where it goes.
+/// The newest messages and their destinations.
 pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,

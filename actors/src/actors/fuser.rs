@@ -51,17 +51,18 @@ pub struct FuserArguments {
     pub aggregator: Aggregator,
     /// Where vehicles' reports wait.
     pub report_queue: LatestReportQueue,
-    /// The newest map of the cell and when it came, the node's own too: a run before this one may have made it.
+    /// The newest map of the cell and its time of receipt. It may be this node's own map, made by
+    /// an earlier run of the actor.
     pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
-    /// Where the aggregator's inputs are recorded.
+    /// Records the aggregator's inputs.
     pub recording: LogSender,
     /// The cell's time.
     pub clock: CellClock,
     /// Where maps and verdicts are published.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// Is told what rounds say about vehicles.
+    /// Receives the evidence of rounds about vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
-    /// Is told which vehicles are present, if the node has one.
+    /// Receives the present vehicles, if the node has an uplink.
     pub uplink: ActorSlot<UplinkMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
@@ -79,22 +80,22 @@ pub struct FuserState {
     report_queue: LatestReportQueue,
     recording: LogSender,
     clock: CellClock,
-    /// The cell's time as the aggregator knows it.
+    /// The cell's time as last set in the aggregator.
     cell_offset_us: i64,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
     uplink: ActorSlot<UplinkMessage>,
-    /// The vehicles that the uplink knows to be present.
+    /// The present vehicles as last sent to the uplink.
     present: BTreeSet<NodeName>,
     counters: Arc<Counters>,
-    /// The newest map of another aggregator or an earlier run, and when it came.
+    /// The newest map of another aggregator or an earlier run, and its time of receipt.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
     alarm: Timestamp,
     timer: Option<AbortHandle>,
-    /// Losses of the aggregator that are counted already.
+    /// Losses of the aggregator that have been counted already.
     losses: [u64; 4],
     spans: Spans,
-    /// Reports of the present round, while their spans are recorded.
+    /// Reports of the current round, while their spans are recorded.
     reports: RoundReports,
 }
 
@@ -127,7 +128,7 @@ impl Actor for Fuser {
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
-                // Also those of which only the run before this one was told.
+                // Includes reports that only the earlier run was notified of.
                 state.take_reports();
                 state.tick();
             }
@@ -171,17 +172,18 @@ impl Actor for Fuser {
     }
 }
 
-/// Time for which reports are refused for their time until it is a trouble: a stalled link costs one or two.
+/// Time for which reports must be refused because of their time before this is a trouble: a stalled
+/// link only affects one or two reports.
 const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 
-/// Lead or delay of an accepted report, in microseconds, from which its sender's clock must be off: far more than reports
-/// take on their way.
+/// Lead or delay of an accepted report, in microseconds, from which its sender's clock must be
+/// wrong: far more than the transit time of reports.
 const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 
 /// Remedy where times seem to be in another unit.
 const OTHER_UNIT_REMEDY: &str = "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970";
 
-/// The lead of a report's time in words.
+/// The lead of a report's time as text.
 fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
     if let Some(unit) = TimeUnit::of(report.captured_at_us) {
         return format!(
@@ -237,7 +239,7 @@ impl FuserState {
         }
     }
 
-    /// Tells the aggregator when the cell's time has moved.
+    /// Updates the aggregator when the cell's time has moved.
     fn follow_clock(&mut self) {
         let offset_us = self.clock.reading().offset_us;
         if std::mem::replace(&mut self.cell_offset_us, offset_us) != offset_us {
@@ -276,7 +278,8 @@ impl FuserState {
         }
     }
 
-    /// Counts a report that was not used. Reports that are refused for their time again and again are a trouble.
+    /// Counts a report that was not used. Reports that are repeatedly refused because of their time
+    /// are a trouble.
     fn note_rejection(
         &self,
         reason: RejectReason,
@@ -322,7 +325,7 @@ impl FuserState {
         }
     }
 
-    /// Notes a clock of a sender's own that is off, though its reports are put right.
+    /// Records a trouble if a sender's clock is wrong although its reports are corrected.
     fn note_clock(&self, report: &ObjectReport, received_at: Timestamp) {
         let lead_us = self.lead_us(report, received_at);
         if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
@@ -340,7 +343,7 @@ impl FuserState {
         }
     }
 
-    /// Notes doubts about a report that was used.
+    /// Records doubts about a report that was used.
     fn note_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
         for doubt in self.aggregator.doubts(kind, report, received_at) {
             let trouble = match doubt {
@@ -362,7 +365,8 @@ impl FuserState {
             .micros_from(self.clock.date(received_at))
     }
 
-    /// Compares a location that a report names with the known ones; another one each time.
+    /// Compares a location that a report names with the configured landmarks; each call checks
+    /// another location of the report.
     fn compare_locations(&self, kind: ReportKind, report: &ObjectReport) {
         let objects = report
             .objects
@@ -390,7 +394,7 @@ impl FuserState {
         }
     }
 
-    /// Keeps the map that was accepted last, to go on from it when this node leads.
+    /// Stores the map that was accepted last, to continue from it when this node leads.
     fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
         if self.aggregator.leads().is_none() {
             self.last_map = Some((map, received_at));
@@ -428,7 +432,7 @@ impl FuserState {
         self.command(Command::Tick);
     }
 
-    /// Tells the aggregator; a tick that is not due says nothing and is not recorded.
+    /// Passes a command to the aggregator and records it. A tick that is not due is not recorded.
     fn command(&mut self, command: Command) {
         let now = clock::now();
         if command != Command::Tick || now >= self.aggregator.deadline() {
@@ -439,7 +443,7 @@ impl FuserState {
         }
     }
 
-    /// Counts what the aggregator has left out since it was last asked.
+    /// Counts the aggregator's losses since the last call.
     fn count_losses(&mut self) {
         let TracksLosses { late, refused } = self.aggregator.tracks_losses();
         let now = [
@@ -496,7 +500,8 @@ impl FuserState {
         self.tell_uplink(now);
     }
 
-    /// Counts entries that this node left out of its map or verdicts, by the vehicles whose statements are in them.
+    /// Counts entries that this node left out of its map or verdicts, by the vehicles whose
+    /// statements are in them.
     fn report_left_out(&self, left_out: &[InvalidEntry]) {
         for InvalidEntry {
             reason,
@@ -525,7 +530,7 @@ impl FuserState {
         }
     }
 
-    /// Tells the uplink when a vehicle has come or left.
+    /// Informs the uplink when the set of present vehicles has changed.
     fn tell_uplink(&mut self, now: Timestamp) {
         if self.uplink.get().is_none() {
             return;
@@ -540,7 +545,8 @@ impl FuserState {
         }
     }
 
-    /// One alarm is enough unless the deadline has moved to before it; an early alarm closes nothing and is set anew.
+    /// Sets the alarm for the deadline. An existing alarm is replaced only if the deadline has
+    /// become earlier; an early alarm closes no round and is set again.
     fn set_alarm(&mut self, myself: &ActorRef<FuserMessage>) {
         let deadline = self.aggregator.deadline();
         if deadline < self.alarm {

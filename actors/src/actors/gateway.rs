@@ -1,7 +1,8 @@
 //! The actor that owns all MQTT connections of a node.
 //!
-//! It keeps a link to each configured broker, usually the aggregator's and its standby's: a change of aggregator then
-//! needs no new connection. Every payload is encoded once and sent on every link.
+//! It keeps a link to each configured broker, usually the aggregator's and its standby's: a change
+//! of aggregator then needs no new connection. Every payload is encoded once and sent on every
+//! link.
 //!
 //! ```text
 //! other actors ── PublishReport, PublishMap, … ──> Gateway ── try_publish ──> link ── MQTT ──> broker
@@ -9,11 +10,13 @@
 //!        └───────────── Subscriber ◄──────────────────┴─── Inbox ◄── link task ◄── MQTT ─────────┘
 //! ```
 //!
-//! - Nothing waits: a link that is down or full refuses, which is counted. A new connection starts with an empty queue,
-//!   so that no old message is sent late.
-//! - The link's own task decodes packets. A payload that cannot be used is a counter, never an error.
+//! - Publishing does not block: a link that is down or full refuses the message, which is counted.
+//!   A new connection starts with an empty queue, so that old messages are not sent late.
+//! - The link's own task decodes packets. A payload that cannot be used is counted and is not an
+//!   error.
 //! - The node's own messages reach its own receivers in-process. The broker's echo is dropped.
-//! - `nodes/<node>` is published on every connection before anything else and has `offline` as last will.
+//! - `nodes/<node>` is published on every connection before anything else and has `offline` as last
+//!   will.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -61,9 +64,9 @@ pub struct GatewayArguments {
     pub counters: Arc<Counters>,
     /// Callback for every message.
     pub subscriber: Subscriber,
-    /// Seed of the jitter between attempts to connect.
+    /// Seed of the jitter between connection attempts.
     pub seed: u64,
-    /// True if the node only looks on: once it has stopped, no broker keeps its status.
+    /// True if the node only observes: after it has stopped, the brokers have no status of it.
     pub looks_on: bool,
 }
 
@@ -78,7 +81,7 @@ pub struct GatewayState {
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
     looks_on: bool,
-    /// True if to subscribe to reports on every broker.
+    /// True if reports are subscribed to on every broker.
     watches_reports: bool,
     status: NodeStatus,
     status_topic: String,
@@ -87,7 +90,7 @@ pub struct GatewayState {
     next_link: u64,
     /// Topics whose last payload was too large to be sent.
     too_large: BTreeSet<String>,
-    /// Other living runs of this node's name.
+    /// Other running processes with this node's name.
     namesakes: BTreeSet<Uuid>,
     inbox: Arc<Inbox>,
     setup: Arc<LinkSetup>,
@@ -204,8 +207,9 @@ fn publishing() -> Span {
     tracing::info_span!("publish")
 }
 
-/// Lets the links' tasks send the message before this node's own actors process it. It spares others latency; no order
-/// depends on it: the message is in every link's queue already.
+/// Lets the links' tasks send the message before this node's own actors process it. This reduces
+/// latency for other nodes; the order does not depend on it, because the message is in every link's
+/// queue already.
 async fn links_first() {
     tokio::task::yield_now().await;
 }
@@ -247,8 +251,8 @@ impl GatewayState {
             Arc::clone(&counters),
             subscriber,
         );
-        // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
-        // will comes before the new status.
+        // Each run has its own client id. With a shared id, a broker would end the old connection
+        // before it accepts the new one, so that the last will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
         let sink = Arc::<Inbox>::clone(&inbox);
@@ -290,7 +294,7 @@ impl GatewayState {
             .extract_if(.., |_, link| !wanted.remove(&link.broker))
             .collect();
         for (_, link) in gone {
-            // Deletes the retained status: that broker would not learn of later changes.
+            // Deletes the retained status, because that broker would not receive later changes.
             link.publish(&self.status_topic, &Bytes::new(), Retention::Retained);
             tokio::spawn(link.leave(LEAVE_TIMEOUT));
         }
@@ -315,7 +319,7 @@ impl GatewayState {
             .collect()
     }
 
-    /// True if this node itself needs the reports on a broker.
+    /// True if this node needs the reports on a broker for itself.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
         match self.role {
             SubscriptionRole::Candidate => self
@@ -378,7 +382,8 @@ impl GatewayState {
         }
     }
 
-    /// Expects the echo of a message that was just sent. A link whose broker has not echoed for too long is stalled.
+    /// Expects the echo of a message that was just sent. A link whose broker has sent no echo for
+    /// too long counts as stalled.
     fn expect_echo(&mut self, topic: &Topic) {
         let now = clock::now();
         let of_all = matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts);
@@ -397,8 +402,8 @@ impl GatewayState {
         }
     }
 
-    /// True if receivers with this node's limits accept a payload. A larger one would cut links, or every receiver would
-    /// drop it. The first of each topic is logged.
+    /// True if receivers with this node's limits accept a payload of this size. A larger one would
+    /// break links or be dropped by every receiver. The first such payload of each topic is logged.
     fn fits<T: Payload>(&mut self, topic: &str, bytes: usize) -> bool {
         let limit = T::max_bytes(&self.setup.config.limits());
         if bytes <= limit {
@@ -461,7 +466,7 @@ impl GatewayState {
                 return;
             }
             LinkChange::Namesake(run) => {
-                // One answer for each run: the other run is warned too, and the exchange ends.
+                // One answer for each run: it warns the other run too, and ends the exchange.
                 if self.namesakes.len() < MAX_NAMESAKES && self.namesakes.insert(run) {
                     let node = &self.status.node;
                     tracing::warn!(broker = %link.broker, %node, %run, "another living node has this node's name, rename one");
@@ -506,5 +511,5 @@ fn tell_state(inbox: &Inbox, link: &Link) {
     );
 }
 
-/// Maximum runs with this node's name that are logged.
+/// Maximum number of other runs with this node's name that are logged.
 const MAX_NAMESAKES: usize = 16;

@@ -1,4 +1,4 @@
-//! The actor that carries out what the node's leadership decides.
+//! The actor that carries out the effects of the node's leadership.
 //!
 //! ```text
 //! Membership ── who is there, messages ──┐                    ┌── Lead, HoldRound, StopPublishing ──> Fuser
@@ -9,8 +9,9 @@
 //!                                                  └──> watch of the leadership
 //! ```
 //!
-//! [`LeadershipNode`](ecod::leadership::node::LeadershipNode) decides. The actor turns messages into its inputs, carries
-//! out its effects in their order, and wakes it at its deadline.
+//! [`LeadershipNode`](ecod::leadership::node::LeadershipNode) makes the decisions. The actor
+//! converts messages to inputs, carries out the effects in order, and wakes the machine at its
+//! deadline.
 
 mod driver;
 mod life_signs;
@@ -47,7 +48,7 @@ use crate::transport::broker::Door;
 use crate::transport::gossip::Member;
 use crate::transport::pki::Credentials;
 
-/// Where the parts that the election commands or asks are reached.
+/// Addresses of the parts that the election commands or queries.
 #[derive(Debug, Clone)]
 pub struct Parts {
     /// Sends messages to other nodes.
@@ -60,13 +61,13 @@ pub struct Parts {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// Keeps the cell's description.
     pub description: ActorSlot<DescriptionKeeperMessage>,
-    /// Tells the region of the node's status.
+    /// Publishes the node's status to the region.
     pub uplink: ActorSlot<UplinkMessage>,
     /// The node's own broker.
     pub broker: ActorSlot<BrokerMessage>,
-    /// Shows the node's status to programs.
+    /// Publishes the node's status to local programs.
     pub door: Door,
-    /// Gets the node's status for the log.
+    /// Records the node's status in the log.
     pub recording: LogSender,
     /// Settings of the cell, and whether the node uses them.
     pub shared: watch::Receiver<SharedFacts>,
@@ -76,17 +77,18 @@ pub struct Parts {
 pub struct LeaderElectionArguments {
     /// Settings of the node's leadership.
     pub settings: NodeSettings,
-    /// Where the term is kept, if anywhere.
+    /// File that holds the term, if any.
     pub term_file: Option<StateFile>,
-    /// Where the node's own broker listens.
+    /// Address at which the node's own broker listens.
     pub own_broker: watch::Receiver<Option<SocketAddr>>,
-    /// Where the node's page listens.
+    /// Address at which the node's page listens.
     pub page: watch::Receiver<Option<SocketAddr>>,
     /// The other nodes.
     pub members: watch::Receiver<Vec<Member>>,
     /// The parts it commands.
     pub parts: Parts,
-    /// Gets the leadership whenever it changes. A change of the highest known term alone wakes nobody.
+    /// Receives the leadership whenever it changes. A change of only the highest term does not
+    /// notify readers.
     pub leadership: watch::Sender<Leadership>,
     /// Shows the cell's time.
     pub clock: CellClock,
@@ -112,7 +114,7 @@ impl Actor for LeaderElection {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        // A run before this one may have left the fuser leading.
+        // An earlier run may have left the fuser leading.
         arguments.parts.fuser.send(FuserMessage::StopPublishing);
         let mut driver = ElectionDriver::new(arguments, myself);
         driver.handle(Input::Wake).await;
@@ -135,7 +137,7 @@ impl Actor for LeaderElection {
         Ok(())
     }
 
-    /// Gives up the lead, if this node has it, so that the next one need not find out.
+    /// Resigns if this node leads, so that the next leader does not have to detect the loss.
     async fn post_stop(
         &self,
         _myself: ActorRef<Self::Msg>,

@@ -1,4 +1,5 @@
-//! The actor that owns the gossip socket: liveness of nodes, independent of MQTT, and small datagrams between nodes.
+//! The actor that owns the gossip socket: liveness of nodes, independent of MQTT, and small
+//! datagrams between nodes.
 //!
 //! ```text
 //! LeaderElection ── Send ──> Membership <──── UDP ────> other nodes
@@ -46,7 +47,8 @@ pub struct MembershipArguments {
     pub run: u64,
     /// The role it was started with.
     pub role: Role,
-    /// Address of the node's broker, if it has one. Others replace 0.0.0.0 by the address at which they see the node.
+    /// Address of the node's broker, if it has one. Other nodes replace 0.0.0.0 by the address from
+    /// which the node's packets arrive.
     pub broker: Option<SocketAddr>,
     /// The node's certificates. With them, all nodes of the cell prove theirs.
     pub credentials: Option<Arc<Credentials>>,
@@ -54,7 +56,7 @@ pub struct MembershipArguments {
     pub config: MembershipConfig,
     /// Callback for every event.
     pub events: EventSink,
-    /// All living nodes but this one, by name.
+    /// All living nodes except this one, by name.
     pub members: watch::Sender<Vec<Member>>,
     /// The counters of the gossip socket.
     pub counters: Arc<FrameCounters>,
@@ -69,7 +71,7 @@ pub struct MembershipState {
     machine: GossipMachine,
     socket: Arc<GossipSocket>,
     deadline: watch::Sender<Option<Timestamp>>,
-    /// Tells the socket's task that a [`MembershipMessage::Wake`] was handled.
+    /// Notifies the socket's task that a [`MembershipMessage::Wake`] was handled.
     handled: Arc<Notify>,
     events: EventSink,
     members: watch::Sender<Vec<Member>>,
@@ -205,7 +207,7 @@ impl Actor for Membership {
                 if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity)
                 {
                     state.machine.set_identity(identity, now);
-                    // Nodes may have shown renewed certificates, which is no event.
+                    // Nodes may have shown renewed certificates, for which there is no event.
                     state.tell_members();
                 }
             }
@@ -217,7 +219,8 @@ impl Actor for Membership {
 }
 
 impl MembershipState {
-    /// Processes waiting datagrams before due timers: after a stall, signs of life come before suspicions.
+    /// Processes waiting datagrams before due timers: after a stall, signs of life come before
+    /// suspicions.
     fn wake(&mut self) {
         let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
         for _ in 0..MAX_DATAGRAMS_PER_WAKE {
@@ -272,7 +275,7 @@ impl MembershipState {
     }
 }
 
-/// The node's certificates, and whether its own was valid when last looked at.
+/// The node's certificates, and whether its own certificate was valid at the last check.
 struct CertificateWatch {
     credentials: Arc<Credentials>,
     own: Option<Distrust>,
@@ -286,8 +289,8 @@ impl CertificateWatch {
         }
     }
 
-    /// The present certificates and time. Logs when the own certificate begins or ceases to be valid, such as when the
-    /// clock is set.
+    /// The current certificates and time. Logs when the node's own certificate becomes valid or
+    /// invalid, for example after a change of the clock.
     fn identity(&mut self) -> Identity {
         let (credentials, wall) = (self.credentials.current(), UnixTime::now());
         let own = credentials
@@ -359,7 +362,7 @@ async fn watch_socket(
 /// Time between two attempts to join the multicast group.
 const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 
-/// Joins the multicast group, if enabled; false when that does not work, or not yet.
+/// Joins the multicast group, if enabled; returns false if that fails.
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     if config.enabled && socket.address().is_ipv6() {
         tracing::warn!(

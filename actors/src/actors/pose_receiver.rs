@@ -1,4 +1,4 @@
-//! The actor that receives a moving vehicle's poses from its localisation, one in each datagram.
+//! The actor that receives a moving vehicle's poses from its localisation, one pose per datagram.
 //!
 //! ```text
 //! localisation ── UDP ──> PoseReceiver ── TakePose ──> Projector of each camera

@@ -35,15 +35,15 @@ use crate::telemetry::counters::{Counters, Event};
 
 /// Arguments of a projector's start.
 pub struct ProjectorArguments {
-    /// Camera and known locations.
+    /// Camera and landmarks.
     pub perception: Perception,
-    /// The pose of a vehicle that stands still, if it is known.
+    /// The pose of a vehicle that stands still, if available.
     pub standing: Option<Pose>,
     /// The place of the cell's frame on Earth.
     pub origin: Option<GeographicOrigin>,
     /// True for a moving vehicle, whose poses are received.
     pub is_moving: bool,
-    /// Its poses of the last moments.
+    /// The vehicle's most recent poses.
     pub recent_poses: VecDeque<(Timestamp, StatedPose)>,
     /// True for a fixed camera.
     pub is_fixed: bool,
@@ -53,7 +53,7 @@ pub struct ProjectorArguments {
     pub clock: CellClock,
     /// Publisher of the reports.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// Shows frames with their boxes, if they are shown at all.
+    /// Shows frames with their boxes, if the page shows the camera.
     pub camera_feed: Option<Arc<CameraFeed>>,
     /// Troubles of the camera.
     pub troubles: CameraTroubles,
@@ -73,7 +73,7 @@ pub struct ProjectorState {
     is_fixed: bool,
     /// Recent poses of a moving vehicle.
     poses: Option<PoseHistory>,
-    /// True once the log has said why a pose is not used.
+    /// True once the log contains the reason why a pose is not used.
     is_pose_problem_logged: bool,
     algorithms: Algorithms,
     clock: CellClock,
@@ -168,7 +168,7 @@ impl Actor for Projector {
 }
 
 impl ProjectorState {
-    /// Goes on in a frame with this origin. Poses in another one are forgotten.
+    /// Continues in a frame with this origin. Poses in another frame are dropped.
     fn move_to(&mut self, origin: Option<GeographicOrigin>) {
         if self.origin != origin {
             self.origin = origin;
@@ -193,7 +193,8 @@ impl ProjectorState {
         }
     }
 
-    /// Publishes the report of a frame. Boxes of its detections get the objects that these became.
+    /// Publishes the report of a frame. The boxes of its detections are linked to the resulting
+    /// objects.
     fn report(
         &mut self,
         detections: Vec<Detection>,
@@ -273,7 +274,7 @@ impl ProjectorState {
     }
 }
 
-/// The report as VOTE needs it: objects at known locations only.
+/// The report in the form that VOTE needs: only objects at landmarks.
 pub fn votes(report: &ObjectReport) -> ObjectReport {
     let objects = report
         .objects

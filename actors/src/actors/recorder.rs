@@ -1,14 +1,15 @@
-//! The actor that records the node's messages, so that its aggregator can be rerun.
+//! The actor that records the node's messages, so that its aggregator can be replayed.
 //!
 //! ```text
 //! Fuser, Follower, Gateway's subscriber ── LogSender ──> bounded queue ──> writer thread ──> DIR/<node>-<time>.mcap
 //! Recorder ── leadership, counters ───────────┘
 //! ```
 //!
-//! - Nothing waits for the disk. A full queue drops and counts entries; the log notes dropped inputs of the aggregator.
-//! - Every second the log is flushed in whole chunks. The end of the process loses one second at most, and readers that
-//!   do not need the end of the file read the rest.
-//! - A failing disk is counted, logged once and tried again; the node goes on.
+//! - Recording does not wait for the disk. A full queue drops and counts entries; the log records
+//!   dropped inputs of the aggregator.
+//! - Every second the log is flushed in whole chunks. If the process ends, at most one second is
+//!   lost, and readers that don't need the end of the file can read the rest.
+//! - A failing disk is counted, logged once and tried again; the node continues.
 
 use std::sync::Arc;
 use std::sync::mpsc::sync_channel;

@@ -1,4 +1,4 @@
-//! The actor that keeps what is known about vehicles: publishes, persists and replicates it.
+//! The actor that keeps the evidence about vehicles: it publishes, persists and replicates it.
 //!
 //! ```text
 //! Fuser ── Lead, Record, StepDown ─> ReputationKeeper ── PublishReputations, PublishShare ──> Gateway
@@ -9,11 +9,13 @@
 //! Uplink ── TellUplink ────────────>   └── TellCounts ──> Uplink
 //! ```
 //!
-//! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
-//! the counts that it signed are dropped at once, from the published reputations and from the fuser.
+//! With certificates, this actor signs the counts of its node, and verifies other nodes' counts.
+//! When a certificate is revoked, the counts that it signed are dropped at once, from the published
+//! reputations and from the fuser.
 //!
-//! [`LedgerResync`] decides what is shared with the other candidates, when, and whose evidence is accepted. Reputations are
-//! saved before they are published. The [`ReputationStore`] outlives the actor, and the state directory the node.
+//! [`LedgerResync`] decides which evidence is shared with the other candidates, when it is shared,
+//! and which evidence is accepted. Reputations are saved before they are published. The
+//! [`ReputationStore`] outlives the actor, and the state directory the node.
 
 mod config;
 mod region;
@@ -69,9 +71,9 @@ pub struct ReputationKeeperArguments {
     pub reputation: ReputationConfig,
     /// Its rhythm.
     pub config: ReputationKeeperConfig,
-    /// Knowledge of earlier runs of the actor; shared with whoever starts a fuser.
+    /// Evidence of earlier runs of the actor, shared with the code that starts a fuser.
     pub reputations: SharedReputations,
-    /// Where it is saved, if anywhere.
+    /// File in which it is saved, if any.
     pub file: Option<StateFile>,
     /// The node's certificates; without them evidence is not signed.
     pub credentials: Option<Arc<Credentials>>,
@@ -83,13 +85,13 @@ pub struct ReputationKeeperArguments {
     pub leadership: watch::Receiver<Leadership>,
     /// Where reputations and shares are published.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// Starts from evidence of others.
+    /// Adopts the evidence of other nodes.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Is told whose evidence was taken.
+    /// Is notified of accepted evidence of other candidates.
     pub election: ActorSlot<LeaderElectionMessage>,
-    /// Is told what the region is to know, if the node has one.
+    /// Receives the counts for the region, if the node has an uplink.
     pub uplink: ActorSlot<UplinkMessage>,
-    /// The cell's time, by which resets are judged.
+    /// The cell's time, used for checking resets.
     pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
@@ -99,7 +101,7 @@ pub struct ReputationKeeperArguments {
 #[derive(Debug, Default)]
 pub struct ReputationKeeper;
 
-/// The ledger and what has not been done with it yet.
+/// The ledger and its pending changes.
 pub struct ReputationKeeperState {
     arguments: ReputationKeeperArguments,
     resync: LedgerResync,
@@ -131,7 +133,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::Tick
         });
         if state.signer.is_some() {
-            // Certificates may have been revoked while the actor did not run.
+            // Certificates may have been revoked while the actor was not running.
             state.drop_revoked();
         }
         if let Some(credentials) = state.arguments.credentials.clone() {
@@ -204,7 +206,7 @@ impl ReputationKeeperState {
         );
         let credentials = arguments.credentials.clone();
         let mut writer = StateWriter::new(arguments.file.clone(), "reputations");
-        // A run before may have left something.
+        // An earlier run may have left unsaved changes.
         writer.note_change();
         let resync = if credentials.is_some() {
             LedgerResync::signed
@@ -227,7 +229,7 @@ impl ReputationKeeperState {
         }
     }
 
-    /// Takes over what earlier runs knew, and what is saved.
+    /// Restores the evidence of earlier runs and from disk.
     fn restore(&mut self) {
         store::restore(&self.arguments, self.signer.as_mut());
         self.resync
@@ -242,7 +244,8 @@ impl ReputationKeeperState {
             .as_ref()
             .map(|newest| Arc::clone(&newest.message));
         let mut store = self.arguments.reputations.open();
-        // Where evidence is counted, a false leader's reputations are not to stay when it is revoked.
+        // Where evidence is counted, a false leader's reputations must be dropped when its
+        // certificate is revoked.
         let others =
             newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name));
         if let Some(newest) = others.filter(|_| !store.by_evidence) {
@@ -363,7 +366,7 @@ impl ReputationKeeperState {
         self.publish_shares(passed.shares);
     }
 
-    /// Saves, publishes and uses what has changed.
+    /// Saves, publishes and applies pending changes.
     async fn settle(&mut self) {
         self.save().await;
         self.publish();
@@ -375,7 +378,8 @@ impl ReputationKeeperState {
         }
     }
 
-    /// Publishes what the store says, unless it did so after the same round.
+    /// Publishes the reputations of the store, unless they were already published for the same
+    /// round.
     fn publish(&mut self) {
         let Some(epoch) = self.resync.leads() else {
             return;
@@ -411,7 +415,7 @@ impl ReputationKeeperState {
         self.publish_shares(shares);
     }
 
-    /// Publishes shares; those of the node's own counts are signed first.
+    /// Publishes shares; shares of the node's own counts are signed first.
     fn publish_shares(&mut self, shares: Vec<LedgerShare>) {
         for share in shares {
             let signer = self
@@ -430,8 +434,8 @@ impl ReputationKeeperState {
         }
     }
 
-    /// Drops the evidence of aggregators whose certificate was revoked, and this node's own if it has a new certificate
-    /// since; true if there was any.
+    /// Drops the evidence of aggregators whose certificates were revoked, and this node's own
+    /// evidence if it has a new certificate; returns true if there was any.
     fn drop_revoked(&mut self) -> bool {
         let Some(signer) = &mut self.signer else {
             return false;
@@ -485,7 +489,7 @@ impl ReputationKeeperState {
     }
 }
 
-/// Tells the keeper of changed certificates and revocation lists.
+/// Notifies the keeper of changed certificates and revocation lists.
 async fn watch_certificates(
     credentials: Arc<Credentials>,
     keeper: ActorRef<ReputationKeeperMessage>,

@@ -8,10 +8,12 @@
 //! Fuser ── SetPresent, ReputationKeeper ── TellCounts ──> Uplink ── CellReputation ──> region's broker
 //! ```
 //!
-//! - Nobody in the cell waits for it: without the region the cell goes on, and no map is kept for later. What it knows of
-//!   vehicles is: the latest counts of each wait until the region has them.
-//! - Only the leader is connected. A new leader connects when it leads, so that a last will is always that of a leader.
-//! - Retained messages of a former leader may come late. The present one then repeats its own.
+//! - The cell does not depend on the uplink: without the region the cell continues, and maps are
+//!   not kept for later. Counts about vehicles are kept: the latest counts of each vehicle wait
+//!   until the region has them.
+//! - Only the leader is connected. A new leader connects when it starts to lead, so that a last
+//!   will always belongs to a leader.
+//! - Retained messages of a former leader may come late. The current leader then repeats its own.
 
 mod config;
 mod pace;
@@ -74,15 +76,15 @@ pub struct UplinkArguments {
     pub newest: watch::Receiver<Option<ReceivedMap>>,
     /// The present leadership.
     pub leadership: watch::Receiver<Leadership>,
-    /// Receiver of the objects of neighbours, and of what other cells say of vehicles.
+    /// Receives the objects of neighbours and other cells' counts about vehicles.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Source of what this cell says of vehicles.
+    /// Source of this cell's counts about vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The cell's time, in which resets are dated.
     pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
-    /// Seed of the jitter between attempts to connect.
+    /// Seed of the jitter between connection attempts.
     pub seed: u64,
 }
 
@@ -90,9 +92,9 @@ pub struct UplinkArguments {
 #[derive(Debug, Default)]
 pub struct Uplink;
 
-/// The link, while there is one, and what is published on it.
+/// The link, if connected, and the state published on it.
 pub struct UplinkState {
-    /// Status, origin and description are the present ones.
+    /// Arguments with the current status, origin and description.
     setup: UplinkArguments,
     connection: MqttConfig,
     link: Option<RegionLink>,
@@ -100,11 +102,11 @@ pub struct UplinkState {
     pace: MapPace,
     /// Epoch and round of the map that was published last.
     published: Option<(u64, u64)>,
-    /// Epoch and round of the own map that was looked at last.
+    /// Epoch and round of this cell's map that was processed last.
     seen: Option<(u64, u64)>,
     /// The neighbours of a cell that has a place on Earth.
     neighbours: Option<Neighbours>,
-    /// True if a neighbour's map was accepted since the fuser was told.
+    /// True if a neighbour's map was accepted since the last message to the fuser.
     has_news: bool,
     exchange: ReputationExchange,
     watcher: JoinHandle<()>,
@@ -205,7 +207,7 @@ impl UplinkState {
         }
     }
 
-    /// Connects, leaves or publishes, as the lead and the newest map want it.
+    /// Connects, disconnects or publishes, depending on the leadership and the newest map.
     fn look(&mut self, myself: &ActorRef<UplinkMessage>) {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
@@ -226,7 +228,7 @@ impl UplinkState {
 
     fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
         let receiver = myself.clone();
-        // An uplink that has ended needs nothing.
+        // An uplink that has ended needs no events.
         let subscriber =
             Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
         let (limits, counters) = (self.connection.limits(), Arc::clone(&self.setup.counters));
@@ -267,7 +269,8 @@ impl UplinkState {
         tokio::spawn(async move { link.close(last.as_ref(), reputations).await });
     }
 
-    /// The last status of a node that leaves the region; none if another leads, which has told its own.
+    /// The last status of a node that leaves the region; `None` if another node leads, because that
+    /// node has published its own status.
     fn farewell(&self) -> Option<NodeStatus> {
         let leadership = self.setup.leadership.borrow();
         let is_succeeded = leadership
@@ -281,7 +284,7 @@ impl UplinkState {
         (!is_succeeded).then(gone)
     }
 
-    /// Publishes on a new connection what the region is to know.
+    /// Publishes the initial messages on a new connection.
     fn introduce(&mut self) {
         self.exchange.connect();
         self.publish_status();
@@ -292,7 +295,8 @@ impl UplinkState {
         self.publish_map();
     }
 
-    /// Publishes the own status, unless the lead has just been lost: it would have the epoch of the next leader.
+    /// Publishes the node's own status, unless leadership was just lost: the status would contain
+    /// the epoch of the next leader.
     fn publish_status(&mut self) {
         let status = self.own_status();
         let leads = self.setup.leadership.borrow().is_leading();
@@ -317,7 +321,8 @@ impl UplinkState {
         }
     }
 
-    /// Looks at the newest map, if it is of this leadership and not old, and publishes it if it is new and due.
+    /// Processes the newest map if it belongs to this leadership and is recent, and publishes it if
+    /// it is new and due.
     fn publish_map(&mut self) {
         let now = clock::now();
         let Some(ReceivedMap { received_at, map }) = self.setup.newest.borrow().clone() else {
@@ -340,7 +345,7 @@ impl UplinkState {
             return;
         }
         self.pace.advance(now);
-        // Objects of neighbours are theirs to tell.
+        // Objects of neighbours are published by their own cells.
         let map = GlobalMap {
             neighbour_objects: Vec::new(),
             ..GlobalMap::clone(&map)
@@ -360,7 +365,8 @@ impl UplinkState {
         }
     }
 
-    /// Goes on under other settings. A cell that is in another tile now empties the former one, if it is connected.
+    /// Applies other settings. If the cell is in another tile now, its messages in the former tile
+    /// are removed, if it is connected.
     fn configure(
         &mut self,
         origin: Option<GeographicOrigin>,
@@ -383,7 +389,7 @@ impl UplinkState {
         self.look(myself);
     }
 
-    /// Repeats the own status where a last will, or a former leader, has replaced it.
+    /// Repeats the node's own status if a last will or a former leader has replaced it.
     fn hear_status(&mut self, heard: &NodeStatus) {
         let own = self.own_status();
         let is_former = (heard.epoch, &heard.node) < (own.epoch, &own.node);
@@ -392,7 +398,8 @@ impl UplinkState {
         }
     }
 
-    /// Takes the map of another cell; one that does not count is counted by its reason and cell.
+    /// Processes the map of another cell; a map that is not accepted is counted by its reason and
+    /// cell.
     fn take_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
         let Some(neighbours) = &mut self.neighbours else {
             return;
@@ -429,7 +436,8 @@ impl UplinkState {
         }
     }
 
-    /// Tells the fuser of the objects of others, once for each own map: the next one has them.
+    /// Sends the objects of other cells to the fuser, once for each own map, so that the next map
+    /// contains them.
     fn tell_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
         let Some(neighbours) = &mut self.neighbours else {
             return;

@@ -50,7 +50,8 @@ pub struct Calibration {
     pub cy: f64,
     /// OpenCV's k1, k2, p1, p2, k3.
     pub distortion: [f64; 5],
-    /// Root mean square distance in pixels between found and reprojected corners; good is below 0.5.
+    /// Root mean square distance in pixels between found and reprojected corners; good is below
+    /// 0.5.
     pub rms_px: f64,
     /// Photographs used.
     pub images: Vec<PathBuf>,
@@ -109,10 +110,10 @@ pub enum CalibrationError {
     Malformed(PathBuf, String),
 }
 
-/// Photographs among files and directories; those of a directory in the order of their names.
+/// Photographs among files and directories; the files of a directory are sorted by name.
 ///
 /// # Errors
-/// [`CalibrationError::Directory`] when one cannot be listed.
+/// Returns [`CalibrationError::Directory`] if a directory cannot be listed.
 pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> {
     let mut photographs = Vec::new();
     for path in paths {
@@ -130,7 +131,7 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
 /// A photograph as 8-bit gray.
 ///
 /// # Errors
-/// [`CalibrationError::UnreadableImage`].
+/// Returns [`CalibrationError::UnreadableImage`].
 pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
     let unreadable = |_| CalibrationError::UnreadableImage(path.to_owned());
     let mut gray = Mat::default();
@@ -143,10 +144,11 @@ pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
     Ok(gray)
 }
 
-/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.
+/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and
+/// all over the image.
 ///
 /// # Errors
-/// [`CalibrationError`], naming the image it is about.
+/// Returns a [`CalibrationError`], that names the image it is about.
 pub fn calibrate(
     images: &[PathBuf],
     board: &Chessboard,
@@ -227,7 +229,7 @@ impl Calibration {
     /// Reads a calibration file.
     ///
     /// # Errors
-    /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
+    /// Returns [`CalibrationError::File`] or [`CalibrationError::Malformed`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         let text = bounded_file::read_text(path)
             .map_err(|error| CalibrationError::File(path.to_owned(), error))?;
@@ -249,7 +251,7 @@ impl Calibration {
     /// Writes a calibration file.
     ///
     /// # Errors
-    /// [`CalibrationError::File`] when it cannot be written.
+    /// Returns [`CalibrationError::File`] if it cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), CalibrationError> {
         let text = toml::to_string(self)
             .map_err(|error| CalibrationError::Malformed(path.to_owned(), error.to_string()))?;

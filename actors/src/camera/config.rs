@@ -19,8 +19,9 @@ use super::lens::Lens;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
-    /// Name of the camera, distinct among those of its vehicle. Default none: it reports under the vehicle's own name, and
-    /// with a name as a part of it, such as `euclid--rear`.
+    /// Name of the camera, unique among the cameras of its vehicle. Default: not set; the camera
+    /// then reports under the vehicle's own name. With a name it reports as a part of the vehicle,
+    /// such as `euclid--rear`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Source of frames.
@@ -28,8 +29,8 @@ pub struct CameraConfig {
     /// Stall timeout and retries of the source.
     #[serde(default)]
     pub capture: CaptureConfig,
-    /// Image size and field of view. Frames of the same aspect ratio are scaled. Others are rejected, unless only a field
-    /// of view is given: it then holds for frames of any shape.
+    /// Image size and field of view. Frames of the same aspect ratio are scaled. Others are
+    /// rejected, unless only a field of view is given: it then holds for frames of any shape.
     #[serde(default)]
     pub optics: OpticsConfig,
     /// Position and attitude of the camera on the vehicle.
@@ -43,7 +44,7 @@ pub struct CameraConfig {
     /// Conditions for a location to be in view.
     #[serde(default)]
     pub view: ViewConfig,
-    /// True if to vote on objects at known locations, in a cell that runs VOTE. Default true.
+    /// Whether to vote on objects at landmarks, in a cell that runs VOTE. Default true.
     #[serde(default = "yes")]
     pub votes: bool,
 }
@@ -59,17 +60,17 @@ fn yes() -> bool {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpticsConfig {
-    /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default none.
+    /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default: not set.
     pub calibration: Option<PathBuf>,
-    /// Image width in pixels. Default none: without `height_px`, frames may have any shape.
+    /// Image width in pixels. Default: not set. Without `height_px`, frames may have any shape.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub width_px: Option<u32>,
-    /// Image height in pixels. Default none.
+    /// Image height in pixels. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_px: Option<u32>,
     /// Horizontal field of view in degrees. Default 62.2, the Raspberry Pi Camera Module 2.
     pub horizontal_fov_deg: f64,
-    /// Vertical field of view in degrees. Default none: pixels are square.
+    /// Vertical field of view in degrees. Default: not set; pixels are then square.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vertical_fov_deg: Option<f64>,
 }
@@ -80,11 +81,12 @@ pub struct OpticsConfig {
 pub struct MountConfig {
     /// Metres ahead of the vehicle's reference point. Default 0.
     pub forward_m: f64,
-    /// Metres to the left of it. Default 0.
+    /// Metres to the left of the reference point. Default 0.
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in degrees, counter-clockwise. Default 0.
     pub pan_deg: f64,
-    /// Height of the camera above the ground in metres. Default none: the ground gives no distances.
+    /// Height of the camera above the ground in metres. Default: not set; the ground then gives no
+    /// distances.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
     /// Angle of the axis below the horizon in degrees. Default 0.
@@ -106,7 +108,8 @@ impl Default for OpticsConfig {
 }
 
 impl CameraConfig {
-    /// Name under which the camera of a vehicle reports; that of the vehicle if the two make none together.
+    /// Name under which the camera of a vehicle reports; the vehicle's name if both together are
+    /// not a valid name.
     pub fn reporter(&self, vehicle: &NodeName) -> NodeName {
         let part = self
             .name
@@ -118,7 +121,7 @@ impl CameraConfig {
     /// Checks every value; files and devices are checked when they are opened.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if let Some(name) = self
             .name
@@ -186,11 +189,11 @@ impl OpticsConfig {
         })
     }
 
-    /// Intrinsics and distortion, from the calibration file if there is one. Without a size they are those of a frame of
-    /// 640x480.
+    /// Intrinsics and distortion, from the calibration file if there is one. Without a size they
+    /// apply to a frame of 640x480.
     ///
     /// # Errors
-    /// [`CalibrationError`] when the file cannot be used.
+    /// Returns a [`CalibrationError`] if the file cannot be used.
     pub fn lens(&self) -> Result<Lens, CalibrationError> {
         if let Some(path) = &self.calibration {
             return Ok(Calibration::read(path)?.lens());
@@ -227,7 +230,7 @@ impl MountConfig {
         check_range("roll_deg", self.roll_deg, -180.0, 180.0)
     }
 
-    /// A mount in the file's units, rounded to what anyone can measure.
+    /// A mount in the file's units, rounded to practical measuring accuracy.
     pub(crate) fn rounded(mount: &Mount) -> Self {
         let metres = |metres: f64| (metres * 1e3).round() / 1e3;
         let degrees = |angle_rad: f64| (angle_rad.to_degrees() * 1e2).round() / 1e2;

@@ -20,12 +20,13 @@ pub enum CornerPoseError {
 
 /// Centre of a square target in the camera frame, in metres: x right, y down, z along the axis.
 ///
-/// `corners` are undistorted pixels in the order of [`ecod::model::detection::Detection::corners`]; `side_m` is the length of
-/// a side. Infinitesimal plane-based pose estimation finds two poses (Collins and Bartoli 2014, OpenCV's
-/// `SOLVEPNP_IPPE_SQUARE`). The result is the one that faces the camera with the smaller reprojection error.
+/// `corners` are undistorted pixels in the order of [`ecod::model::detection::Detection::corners`];
+/// `side_m` is the length of a side. Infinitesimal plane-based pose estimation finds two poses
+/// (Collins and Bartoli 2014, OpenCV's `SOLVEPNP_IPPE_SQUARE`). The result is the one that faces
+/// the camera with the smaller reprojection error.
 ///
 /// # Errors
-/// [`CornerPoseError`] when no such pose exists.
+/// Returns a [`CornerPoseError`] if no such pose exists.
 pub fn locate_target(
     corners: &[Point2<f64>; 4],
     side_m: f64,
@@ -37,8 +38,8 @@ pub fn locate_target(
     }
 }
 
-/// Corners with one moved by a thousandth of a pixel. OpenCV finds no finite pose for many symmetric squares, which
-/// whole-pixel corners often form.
+/// Corners with one moved by a thousandth of a pixel. OpenCV finds no finite pose for many
+/// symmetric squares, which whole-pixel corners often form.
 fn perturbed(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
     let [first, second, third, fourth] = *corners;
     [

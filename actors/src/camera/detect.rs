@@ -20,12 +20,14 @@ use crate::camera::frame::CameraFrame;
 
 /// Detector of objects in images.
 ///
-/// A detector may keep state between frames and may take tens of milliseconds: call it off the async threads.
+/// A detector may keep state between frames and may take tens of milliseconds: call it off the
+/// async threads.
 pub trait Detect: Send {
     /// Objects in the frame in any order, in pixels of `frame.image`.
     ///
     /// # Errors
-    /// [`DetectError`] when the image is unusable or a library fails; the next frame may succeed.
+    /// Returns a [`DetectError`] if the image is unusable or a library fails; the next frame may
+    /// succeed.
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError>;
 }
 

@@ -21,7 +21,8 @@ pub trait FrameSource: Send {
     /// Waits for the next frame; may block as long as the camera does.
     ///
     /// # Errors
-    /// [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other errors it must be reopened.
+    /// Returns a [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other
+    /// errors it must be reopened.
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError>;
 }
 
@@ -33,7 +34,7 @@ pub enum FrameError {
     Open {
         /// Device, pipeline, address or path.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// One frame is not an image; the source continues.
@@ -41,7 +42,7 @@ pub enum FrameError {
     Unusable {
         /// Path of the frame, or the device.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// A live source delivers no more frames.
@@ -49,7 +50,7 @@ pub enum FrameError {
     Lost {
         /// Device, pipeline, address or path.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// A live source delivered no frame within the timeout.
@@ -72,7 +73,8 @@ pub enum SourceConfig {
         /// Device file. Default `/dev/video0`.
         #[serde(default = "default_device")]
         device: PathBuf,
-        /// Requested image width in pixels. Default 640. The camera takes the nearest size that it has.
+        /// Requested image width in pixels. Default 640. The camera takes the nearest size that it
+        /// has.
         #[serde(default)]
         width: Option<u32>,
         /// Requested image height in pixels. Default 480.
@@ -82,7 +84,8 @@ pub enum SourceConfig {
         #[serde(default)]
         fps: Option<f64>,
     },
-    /// A GStreamer pipeline that ends in `appsink`, such as one from `libcamerasrc` on a Raspberry Pi.
+    /// A GStreamer pipeline that ends in `appsink`, for example with `libcamerasrc` on a Raspberry
+    /// Pi.
     Gstreamer {
         /// The pipeline as for `gst-launch-1.0`; BGR, with `appsink drop=true max-buffers=1`.
         pipeline: String,
@@ -94,9 +97,9 @@ pub enum SourceConfig {
     },
     /// A video file, played at its own rate.
     Video {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// True if to restart at the end. Default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
@@ -107,17 +110,18 @@ pub enum SourceConfig {
         /// Frames per second. Default 10.
         #[serde(default = "default_fps")]
         fps: f64,
-        /// True if to restart at the end. Default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
 }
 
 impl SourceConfig {
-    /// Opens the source; may block as long as the camera does. `timeout` applies to all but files.
+    /// Opens the source; may block as long as the camera does. `timeout` applies to all sources
+    /// except files.
     ///
     /// # Errors
-    /// [`FrameError::Open`] naming the source and what is wrong.
+    /// Returns [`FrameError::Open`] with the source and the cause.
     pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
             Self::V4l2 {
@@ -140,14 +144,15 @@ impl SourceConfig {
         }
     }
 
-    /// Device, pipeline, address or path, as it may be shown: without user and password.
+    /// Device, pipeline, address or path in a form that may be shown: without user and password.
     fn origin(&self) -> String {
         match self {
             Self::V4l2 { device: path, .. }
             | Self::Video { path, .. }
             | Self::Images { path, .. } => path.display().to_string(),
             Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
-            // Without a scheme it is refused, but its secret must not be shown with the error.
+            // Without a scheme the address is refused, but its secret must not be shown with the
+            // error.
             Self::Url { url } if !url.contains("://") => {
                 url.rsplit('@').next().unwrap_or_default().to_owned()
             }
@@ -169,7 +174,7 @@ impl SourceConfig {
     /// Checks every value, but not whether the source exists.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
             Self::V4l2 {

@@ -1,4 +1,5 @@
-//! Image files and JPEG pictures. OpenCV's `imgcodecs` is left out: with it, Debian loads a hundred libraries into a node.
+//! Image files and JPEG pictures. OpenCV's `imgcodecs` is left out: with it, Debian loads a hundred
+//! libraries into a node.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -19,7 +20,7 @@ pub enum ImageError {
     /// The file cannot be read.
     #[error(transparent)]
     File(#[from] std::io::Error),
-    /// The bytes are no whole image of a known format.
+    /// The bytes are not a whole image of a supported format.
     #[error("not an image in BMP, JPEG, PNG, PNM or WebP: {0}")]
     Malformed(#[from] image::ImageError),
     /// The image is wider or higher than JPEG allows.
@@ -33,25 +34,26 @@ pub enum ImageError {
     OpenCv(#[from] opencv::Error),
 }
 
-/// Maximum size in bytes of a decoded image: 10,000 by 8000 pixels with four channels fit. A header of a few bytes may state more
-/// than the machine has.
+/// Maximum size in bytes of a decoded image: 10,000 by 8000 pixels with four channels fit. A header
+/// of a few bytes may state more than the machine's memory.
 const MAX_DECODED_BYTES: u64 = 320_000_000;
 
 /// Maximum size of an image file in bytes.
 const MAX_FILE_BYTES: u64 = 256 * 1024 * 1024;
 
-/// Reads an image file as [`decode`] does.
+/// Reads an image file and decodes it with [`decode`].
 ///
 /// # Errors
-/// [`ImageError::File`] or those of [`decode`].
+/// Returns [`ImageError::File`] or an error of [`decode`].
 pub fn read(path: &Path) -> Result<Mat, ImageError> {
     decode(&bounded_file::read(path, MAX_FILE_BYTES)?)
 }
 
-/// Image in BMP, JPEG, PNG, PNM or WebP as 8-bit BGR without transparency, turned upright as its EXIF data says.
+/// Decodes an image in BMP, JPEG, PNG, PNM or WebP to 8-bit BGR without transparency, turned
+/// upright by its EXIF data.
 ///
 /// # Errors
-/// [`ImageError::Malformed`] or [`ImageError::OpenCv`].
+/// Returns [`ImageError::Malformed`] or [`ImageError::OpenCv`].
 pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     let mut decoder = ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()?
@@ -73,10 +75,12 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     Ok(bgr)
 }
 
-/// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as in OpenCV's files.
+/// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as
+/// in OpenCV's files.
 ///
 /// # Errors
-/// [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an image of another type.
+/// Returns [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an
+/// image of another type.
 pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
     let size = ImageSize::of(image);
     let side = |pixels| u16::try_from(pixels).map_err(|_| ImageError::TooLarge(size));
@@ -102,7 +106,8 @@ pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
     Ok(jpeg)
 }
 
-/// An image in JPEG's own colours. Of the encoder's many kinds of images, programs then have only this one.
+/// An image in JPEG's own colour space. The program then contains only this one of the encoder's
+/// many image types.
 struct Pixels<'a> {
     /// Rows of brightness, with Cr and Cb unless it is gray.
     pixels: &'a [u8],

@@ -28,7 +28,8 @@ pub struct SizeMismatch {
     pub optics: ImageSize,
 }
 
-/// Maximum relative difference between horizontal and vertical scale, which rounding to whole pixels explains.
+/// Maximum relative difference between horizontal and vertical scale, which rounding to whole
+/// pixels explains.
 const ASPECT_TOLERANCE: f64 = 0.01;
 
 impl ImageSize {
@@ -43,7 +44,7 @@ impl ImageSize {
     /// Checks that a frame of this size can be scaled to this one.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for another aspect ratio.
+    /// Returns a [`SizeMismatch`] for another aspect ratio.
     pub fn check_shape(self, frame: Self) -> Result<(), SizeMismatch> {
         let [x, y] = self.scale(frame);
         let is_scaled = x.is_finite() && y.is_finite() && (x / y - 1.0).abs() <= ASPECT_TOLERANCE;
@@ -65,7 +66,7 @@ impl ImageSize {
     /// Scales detections from a frame's size to this one.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for another aspect ratio; the detections are then unchanged.
+    /// Returns a [`SizeMismatch`] for another aspect ratio; the detections are then unchanged.
     pub fn fit(self, frame: Self, detections: &mut [Detection]) -> Result<(), SizeMismatch> {
         self.check_shape(frame)?;
         if frame == self {

@@ -15,7 +15,7 @@ pub struct Lens {
     pub intrinsics: Intrinsics,
     /// OpenCV's k1, k2, p1, p2, k3; `None` for an ideal lens.
     pub distortion: Option<[f64; 5]>,
-    /// True if frames may have any shape: the horizontal field of view is that of all of them.
+    /// True if frames may have any shape; the horizontal field of view then applies to all of them.
     pub is_any_shape: bool,
 }
 
@@ -32,7 +32,7 @@ impl Lens {
     /// The lens for frames of this size: this one if they have its shape.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    /// Returns a [`SizeMismatch`] for frames of another shape, unless the lens takes any.
     pub fn of_frames(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
         let size = ImageSize::from(&self.intrinsics);
         match size.check_shape(frame) {
@@ -57,7 +57,7 @@ impl Lens {
     /// The lens of frames of this size, with their detections scaled to its image size.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    /// Returns a [`SizeMismatch`] for frames of another shape, unless the lens takes any.
     pub fn fitted(
         &self,
         frame: ImageSize,
@@ -71,7 +71,7 @@ impl Lens {
     /// The lens for pixels of frames of this size.
     ///
     /// # Errors
-    /// As [`Self::of_frames`].
+    /// Returns the errors of [`Self::of_frames`].
     pub fn in_pixels_of(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
         let lens = self.of_frames(frame)?;
         let Intrinsics {
@@ -103,7 +103,7 @@ impl Lens {
     /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
     ///
     /// # Errors
-    /// OpenCV's.
+    /// Returns OpenCV's error.
     pub fn undistort(&self, detections: &mut [Detection]) -> opencv::Result<()> {
         if self.distortion.is_none() {
             return Ok(());
@@ -147,7 +147,7 @@ impl Lens {
     /// Undistorts points.
     ///
     /// # Errors
-    /// OpenCV's.
+    /// Returns OpenCV's error.
     pub fn undistorted(&self, points: &[Point2<f64>]) -> opencv::Result<Vec<Point2<f64>>> {
         let Some(distortion) = self.distortion.filter(|_| !points.is_empty()) else {
             return Ok(points.to_vec());

@@ -1,4 +1,5 @@
-//! The mount of a configured camera: found from points that a person measured, and written for the configuration.
+//! The mount of a configured camera: found from points that a person measured, and written for the
+//! configuration.
 
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;
@@ -11,7 +12,7 @@ use crate::camera::config::MountConfig;
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::camera::lens::Lens;
 
-/// A point of the ground as a person measured it.
+/// A point on the ground as measured by a person.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MeasuredPoint {
@@ -35,11 +36,11 @@ pub enum MeasuredPointsError {
     Fit(#[from] GroundFitError),
 }
 
-/// Fits the whole mount of a camera to points measured in a picture. The fit's pose is that of the camera on the vehicle,
-/// errors in the image are in pixels of the picture.
+/// Fits the whole mount of a camera to points measured in a picture. The pose of the fit is the
+/// camera's pose on the vehicle; errors in the image are in pixels of the picture.
 ///
 /// # Errors
-/// [`MeasuredPointsError`].
+/// Returns a [`MeasuredPointsError`].
 pub fn fit_mount_to_points(
     points: &[MeasuredPoint],
     picture: ImageSize,
@@ -85,10 +86,11 @@ pub fn vehicle_of(camera: &Pose, mount: &Mount) -> Pose {
     }
 }
 
-/// A mount as a table of the configuration, `camera.mount` or that of one of several, with its errors.
+/// A mount as a table of the configuration, `camera.mount` or the table of one of several cameras,
+/// with its errors.
 ///
 /// # Errors
-/// TOML's.
+/// Returns TOML's error.
 pub fn mount_table(
     estimate: &MountEstimate,
     is_one_of_several: bool,

@@ -1,4 +1,5 @@
-//! Processing of one vehicle's detections into a report: undistortion, ranging, placing, field of view.
+//! Processing of one vehicle's detections into a report: undistortion, ranging, placing, field of
+//! view.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -21,7 +22,7 @@ use nalgebra::Point2;
 use crate::camera::corner_pose::locate_target;
 use crate::camera::lens::Lens;
 
-/// A vehicle's camera and the known locations of its cell.
+/// A vehicle's camera and the landmarks of its cell.
 #[derive(Debug, Clone)]
 pub struct VehicleCamera {
     /// The vehicle's name.
@@ -32,7 +33,7 @@ pub struct VehicleCamera {
     pub mount: Mount,
     /// The calibrated camera.
     pub lens: Lens,
-    /// Known locations of the cell.
+    /// Landmarks of the cell.
     pub landmarks: Arc<LandmarkIndex>,
 }
 
@@ -48,10 +49,10 @@ pub struct Perception {
     /// Indices of the detections behind the objects of the last report.
     reported: Vec<usize>,
     discarded: DiscardCounts,
-    /// First and last frame with detections since one had a place.
+    /// First and last frame with detections since a detection last had a place.
     unplaced: Option<[Timestamp; 2]>,
     mount_check: MountCheck,
-    /// The angle that the last frame has told, in radians.
+    /// The angle computed from the last frame, in radians.
     mount_off_rad: Option<f64>,
 }
 
@@ -59,22 +60,24 @@ pub struct Perception {
 #[derive(Debug, Clone, Default)]
 struct DiscardCounts {
     by_reason: BTreeMap<&'static str, u64>,
-    /// Those without a size, by label; at most [`MAX_UNSIZED`] labels.
+    /// Detections without a size, by label; at most [`MAX_UNSIZED`] labels.
     without_size: BTreeMap<Label, u64>,
-    /// True if the last report had one without a size.
+    /// True if the last report had a detection without a size.
     is_size_missing: bool,
-    /// The last reason in the last report, in words.
+    /// The last reason in the last report, as text.
     last_reason: Option<String>,
 }
 
-/// Time for which no detection must have had a place before that is told.
+/// Time without any placed detection before this is reported.
 const UNPLACED_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Maximum labels without a size that are counted: a detector of texts knows any number.
+/// Maximum number of labels without a size that are counted: a detector of texts may produce any
+/// number.
 const MAX_UNSIZED: usize = 8;
 
 impl DiscardCounts {
-    /// Counts one, and logs the first of each reason. A missing size is told otherwise.
+    /// Counts a detection, and logs the first of each reason. A missing size is reported
+    /// separately.
     fn count(&mut self, reason: &'static str, error: &dyn Display) {
         let times = self.by_reason.entry(reason).or_default();
         *times += 1;
@@ -85,7 +88,7 @@ impl DiscardCounts {
         }
     }
 
-    /// Counts one that has no place.
+    /// Counts a detection without a place.
     fn count_unplaced(&mut self, error: &ProjectionError) {
         self.count(error.as_str(), error);
         if let ProjectionError::UnknownSize(label) = error {
@@ -98,8 +101,8 @@ impl DiscardCounts {
 }
 
 impl Perception {
-    /// A producer without reports yet; the configurations must be valid. `gate` limits the distance between an object
-    /// and its known location.
+    /// Creates a producer without reports; the configurations must be valid. `gate` limits the
+    /// distance between an object and its landmark.
     pub fn new(
         vehicle_camera: VehicleCamera,
         projection: ProjectionConfig,
@@ -177,7 +180,7 @@ impl Perception {
         if !objects.is_empty() {
             self.unplaced = None;
         } else if self.discarded.last_reason.is_some() {
-            // An object that was seen long ago is another one.
+            // An object that was last seen long ago counts as a different object.
             let going_on = self
                 .unplaced
                 .filter(|[_, last]| captured_at.since(*last) < UNPLACED_PATIENCE);
@@ -216,7 +219,7 @@ impl Perception {
         &self.discarded.by_reason
     }
 
-    /// The labels that have no size, in words, if one was in the last frame.
+    /// The labels without a size, as text, if one was in the last frame.
     pub fn without_size(&self) -> Option<String> {
         let labels = self
             .discarded
@@ -229,12 +232,13 @@ impl Perception {
             .then(|| format!("detections have no size and are not reported: {labels}"))
     }
 
-    /// The reason, in words, why the last discarded detection of the last report has no place.
+    /// The reason, as text, why the last discarded detection of the last report has no place.
     pub fn last_discard(&self) -> Option<&str> {
         self.discarded.last_reason.as_deref()
     }
 
-    /// The reason in words, if no detection of the last frame has a place and none had one for seconds.
+    /// The reason as text, if all detections of the last frame lack a place, as in the seconds
+    /// before.
     pub fn nothing_placed(&self) -> Option<String> {
         let ([since, last], reason) = (self.unplaced?, self.last_discard()?);
         let time = last.since(since);
@@ -246,7 +250,8 @@ impl Perception {
         })
     }
 
-    /// The angle between mount and reality in words, if the last frame has shown that it is too large.
+    /// The angle between the configured and the observed mount as text, if the last frame has shown
+    /// that it is too large.
     pub fn mount_mismatch(&self) -> Option<String> {
         let off_deg = self.mount_off_rad?.to_degrees();
         let side = if off_deg > 0.0 { "higher" } else { "lower" };
@@ -290,7 +295,7 @@ impl Perception {
         Some(self.with_landmark(placed))
     }
 
-    /// Assigns the object to a known location.
+    /// Assigns the object to a landmark.
     fn with_landmark(&self, object: PerceivedObject) -> PerceivedObject {
         let landmarks = &self.vehicle_camera.landmarks;
         let point = Point2::new(object.x_m, object.y_m);

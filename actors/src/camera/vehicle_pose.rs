@@ -19,33 +19,36 @@ pub struct PoseConfig {
     pub y_m: f64,
     /// Heading in degrees, counter-clockwise from east. Default 0.
     pub heading_deg: f64,
-    /// Latitude (WGS 84) in degrees, north positive. With `longitude_deg` and `azimuth_deg` it replaces the keys above; the
-    /// cell needs an `[origin]` then. Default none.
+    /// Latitude (WGS 84) in degrees, north positive. With `longitude_deg` and `azimuth_deg` it
+    /// replaces the keys above; the cell then needs an `[origin]`. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub latitude_deg: Option<f64>,
-    /// Longitude in degrees, east positive. Default none.
+    /// Longitude in degrees, east positive. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub longitude_deg: Option<f64>,
-    /// Height above the ellipsoid in metres. Default that of the cell's origin.
+    /// Height above the ellipsoid in metres. Default: the height of the cell's origin.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
-    /// Heading in degrees, clockwise from true north. Default none.
+    /// Heading in degrees, clockwise from true north. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub azimuth_deg: Option<f64>,
-    /// UDP address that receives poses from the vehicle's localisation. It replaces the keys above, and a frame without
-    /// a pose near its time is not reported. Default none: the vehicle stands still.
+    /// UDP address that receives poses from the vehicle's localisation. It replaces the keys above,
+    /// and a frame without a pose near its time is not reported. Default: not set; the vehicle
+    /// stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<SocketAddr>,
-    /// False for a camera at the road, which is no object of the map. Default true, a vehicle, even while it stands.
+    /// False for a camera at the road, which is not an object of the map. Default true, a vehicle,
+    /// even while it stands.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub moving: Option<bool>,
 }
 
 impl PoseConfig {
-    /// Checks every value, and that they are of one kind.
+    /// Checks every value, and that the keys belong to one kind of pose.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first key that is out of range, missing or of the other kind.
+    /// Returns a [`ConfigError`] that names the first key that is out of range, missing or of the
+    /// other kind.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.is_fixed() && self.listen.is_some() {
             return Err(ConfigError::new(
@@ -74,7 +77,7 @@ impl PoseConfig {
         pose.validate()
     }
 
-    /// Checks that no part of a pose on Earth stands alone.
+    /// Checks that a pose on Earth is complete.
     fn validate_in_map(&self) -> Result<(), ConfigError> {
         let parts = [
             ("latitude_deg", self.latitude_deg),
@@ -133,7 +136,8 @@ struct FixTime {
 /// Maximum distance from the origin in metres, along each axis.
 const WORLD_M: f64 = 1e8;
 
-/// Reads a pose from JSON, and its time by the node's steady clock, than which the wall clock is `wall_offset_us` more:
+/// Reads a pose from JSON, and its time by the node's steady clock; the wall clock is
+/// `wall_offset_us` ahead of it:
 ///
 /// ```json
 /// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
@@ -141,7 +145,7 @@ const WORLD_M: f64 = 1e8;
 /// ```
 ///
 /// # Errors
-/// The problem as text.
+/// Returns the problem as text.
 pub fn read_pose(
     datagram: &[u8],
     now: Timestamp,

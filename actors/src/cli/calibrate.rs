@@ -1,4 +1,5 @@
-//! `ecod-node calibrate`: a calibration file from photographs of a chessboard, and the mount of a camera.
+//! `ecod-node calibrate`: a calibration file from photographs of a chessboard, and the mount of a
+//! camera.
 
 mod mount;
 
@@ -28,7 +29,8 @@ pub(super) struct CalibrateArguments {
 
 #[derive(Debug, Subcommand)]
 enum CalibrateCommand {
-    /// Find height and tilt of a camera: from points on the ground, a board that lies there, or people who walk
+    /// Find height and tilt of a camera: from points on the ground, a board that lies there, or
+    /// people who walk
     #[command(subcommand)]
     Mount(mount::MountCommand),
 }

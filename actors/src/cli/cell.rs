@@ -1,4 +1,5 @@
-//! `ecod-node cell`: the settings that all nodes of a cell share, at the door of one of them.
+//! `ecod-node cell`: the settings that all nodes of a cell share, through the local broker of one
+//! of them.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -74,7 +75,7 @@ const SERVICE_CONFIGURATION: &str = "/etc/ecod/node.toml";
 /// Maximum time for the node's answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Silence after which no more statuses of nodes are waited for.
+/// Silence after which the command stops waiting for further statuses of nodes.
 const SILENCE: Duration = Duration::from_millis(300);
 
 pub(super) fn run(command: &CellCommand) -> Result<(), Failure> {
@@ -117,7 +118,7 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
     }
 }
 
-/// Sets a description, and prints what it costs.
+/// Sets a description, and prints its cost.
 async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     let shared = SharedConfig::parse(text).map_err(Failure::usage)?;
     let (places, cost) = (shared.landmarks.len(), shared.cost());
@@ -161,7 +162,7 @@ fn read(file: &Path) -> Result<String, Failure> {
     Ok(text)
 }
 
-/// The text of a file that is small enough for a description; no more of a larger one is read.
+/// The text of a file that is small enough for a description; larger files are not read further.
 fn read_bounded(file: &Path) -> anyhow::Result<String> {
     let text = bounded_file::read_text(file)?;
     ensure!(
@@ -190,7 +191,7 @@ impl DoorClient {
         );
         let mut config =
             NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
-        // Version 5 has reasons for refusals; the door asks for no password.
+        // Version 5 has reasons for refusals; the local broker requires no password.
         config.mqtt.version = MqttVersion::V5;
         (config.mqtt.user, config.mqtt.password) = (None, None);
         let address = here(arguments.door.unwrap_or(config.broker_listen()));
@@ -268,7 +269,8 @@ impl DoorClient {
             .unwrap_or(Ok(None))
     }
 
-    /// The next description or status; a node that has none to tell is none of this cell.
+    /// The next description or status; fails if the node has no description or status, because it
+    /// then belongs to another cell.
     async fn expect(&mut self) -> Result<DoorMessage, anyhow::Error> {
         let cell = self.config.cell.clone();
         let silent = || {
@@ -307,7 +309,7 @@ impl DoorClient {
             &payload,
             Retention::Acknowledged,
         );
-        // One that is the present one already is not published anew.
+        // A description that is already in use is not published again.
         self.client
             .subscribe(&[self.topics.path(&Topic::Cell)], MaxQos::AtLeastOnce);
         loop {
@@ -318,7 +320,7 @@ impl DoorClient {
         }
     }
 
-    /// The description as a file, with the nodes that know one in comments.
+    /// The description as a file, with the nodes that have one in comments.
     async fn show(&mut self) -> Result<String, anyhow::Error> {
         let (mut description, mut nodes) = (None, BTreeMap::new());
         loop {
@@ -365,13 +367,13 @@ impl DoorClient {
             };
         }
         shown += &description.map_or_else(String::new, |description| description.text);
-        // Text of others must not steer the terminal.
+        // Text from other nodes must not control the terminal.
         shown.retain(|character| !character.is_control() || "\n\t".contains(character));
         Ok(shown)
     }
 }
 
-/// A message of a node to its programs.
+/// A message of a node to its local programs.
 enum DoorMessage {
     Description(CellDescription),
     Status(NodeStatus),

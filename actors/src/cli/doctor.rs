@@ -28,7 +28,7 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
         .map_err(Failure::usage)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let findings = runtime.block_on(examine(&config, &arguments.config));
-    // A camera may block for good.
+    // A camera may block forever.
     runtime.shutdown_timeout(Duration::ZERO);
     if arguments.json {
         print(&(serde_json::to_string_pretty(&findings).context("findings as JSON")? + "\n"))?;

@@ -1,4 +1,4 @@
-//! `ecod-node init`, `invite` and `join`: a cell from nothing, one machine after the other.
+//! `ecod-node init`, `invite` and `join`: creates a cell and adds machines one after the other.
 
 mod files;
 
@@ -50,8 +50,9 @@ pub(super) struct InviteArguments {
     /// Names of the nodes that may join, each on the machine that gets its token
     #[arg(required = true, value_name = "NAME")]
     names: Vec<NodeName>,
-    /// Highest role of these nodes: `auto` may take over the lead, `edge` is preferred for it, `cav` never leads. Invite at
-    /// least one `auto`, so that the cell goes on without its first machine
+    /// Highest role of these nodes: `auto` may take over leadership, `edge` is preferred as leader,
+    /// `cav` cannot lead. Invite at least one `auto`, so that the cell continues without its first
+    /// machine
     #[arg(long, default_value = "cav", value_parser = ["auto", "cav", "edge"])]
     role: String,
     /// These nodes are an operator's: the cell's description may be set there
@@ -60,10 +61,12 @@ pub(super) struct InviteArguments {
     /// Hours for which this command waits for them
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=720))]
     hours: u32,
-    /// Address at which they reach this command. Default: a free port at all addresses of this machine
+    /// Address at which they reach this command. Default: a free port at all addresses of this
+    /// machine
     #[arg(long, value_name = "IP:PORT")]
     listen: Option<SocketAddr>,
-    /// Node that they ask for the cell where multicast does not reach; may be given several times. Default: this machine
+    /// Node through which they find the cell where multicast does not work; may be given several
+    /// times. Default: this machine
     #[arg(long = "seed", value_name = "HOST:PORT")]
     seeds: Vec<String>,
     #[command(flatten)]
@@ -73,7 +76,8 @@ pub(super) struct InviteArguments {
 /// Flags of `join`.
 #[derive(Debug, Args)]
 pub(super) struct JoinArguments {
-    /// Token that `ecod-node invite` printed; `-` reads it from standard input, so that no list of processes shows it
+    /// Token that `ecod-node invite` printed; `-` reads it from standard input, so that the list of
+    /// processes does not show it
     #[arg(value_parser = read_token)]
     token: Token,
     #[command(flatten)]
@@ -100,14 +104,14 @@ struct DirectoryArguments {
 const MAX_ADDRESSES: usize = 4;
 
 impl InitArguments {
-    /// True if the command goes on as a node.
+    /// True if the command continues as a node.
     pub(super) fn runs_node(&self) -> bool {
         self.node.run
     }
 }
 
 impl JoinArguments {
-    /// True if the command goes on as a node.
+    /// True if the command continues as a node.
     pub(super) fn runs_node(&self) -> bool {
         self.node.run
     }
@@ -122,7 +126,7 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
         city,
         ..
     } = arguments;
-    // Before anything is written: a directory with a CA is no place for another.
+    // Checked before any file is written: a directory with a CA must not get a second one.
     check_name(name).map_err(Failure::usage)?;
     let directory = arguments.node.directory.vacant()?;
     let (role, now) = (role_named(role), clock::now());
@@ -163,7 +167,7 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
             .transpose()?,
     };
     directory.write(name, &welcome, &key_text)?;
-    // It is in the node's own file.
+    // The key is in the node's own file.
     std::fs::remove_file(&key).with_context(|| format!("cannot remove {}", key.display()))?;
     print(&format!(
         "made the cell {cell} and its node {name} in {directory}\n\
@@ -177,7 +181,7 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     arguments.node.start(&directory)
 }
 
-/// Lets nodes in until all have joined or the time is over.
+/// Admits nodes until all have joined or the time is over.
 pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
     let directory = arguments.directory.directory()?;
     let authority = Authority::open(&directory.pki()).map_err(|error| match error {
@@ -265,7 +269,7 @@ pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
 }
 
 impl NodeArguments {
-    /// Runs the node, has the system run it, or tells how to.
+    /// Runs the node, makes the system run it, or prints how to start it.
     fn start(&self, directory: &NodeDirectory) -> Result<(), Failure> {
         if self.run {
             let config = NodeConfig::load(Some(&directory.configuration()), &json!({}))
@@ -290,7 +294,7 @@ impl DirectoryArguments {
         Ok(NodeDirectory::new(self.dir.as_deref())?)
     }
 
-    /// The directory, in which no node is yet.
+    /// The directory, which must not contain a node yet.
     fn vacant(&self) -> Result<NodeDirectory, Failure> {
         let directory = self.directory()?;
         directory.check_vacant().map_err(Failure::usage)?;

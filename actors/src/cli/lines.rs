@@ -21,7 +21,7 @@ pub enum LineRead {
 /// Reads the next line into `line`, of at most `limit` bytes.
 ///
 /// # Errors
-/// When the source cannot be read.
+/// Returns an error if the source cannot be read.
 pub fn read_line(
     source: &mut impl BufRead,
     limit: usize,
@@ -47,7 +47,7 @@ const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 /// Opens a file to read, after a byte order mark.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if path == Path::new("-") {
         return Ok(Box::new(io::stdin().lock()));
@@ -60,7 +60,7 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if kind.is_dir() {
         bail!("cannot read {}: it is a directory", path.display());
     }
-    // A pipe ends with its writer; a device may never end.
+    // A pipe ends with its writer; a device may not end.
     if kind.is_block_device() || kind.is_char_device() && !file.is_terminal() {
         bail!("cannot read {}: it is a device, not a file", path.display());
     }
@@ -74,10 +74,10 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     Ok(Box::new(source))
 }
 
-/// Checks that an output file is none of `inputs`.
+/// Checks that an output file differs from all `inputs`.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
     // A file may have several names.
     let file = |path: &Path| {
@@ -92,10 +92,10 @@ pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<
     Ok(())
 }
 
-/// Creates or truncates a file that is none of `inputs`.
+/// Creates or truncates a file that differs from all `inputs`.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>> {
     if path == Path::new("-") {
         return Ok(Box::new(BufWriter::new(io::stdout().lock())));

@@ -55,14 +55,16 @@ pub enum LogFormat {
     Journal,
 }
 
-/// Standard variable with the collector of spans; without it nothing is exported.
+/// Standard variable with the address of the collector of spans; spans are exported only if it is
+/// set.
 const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 
 /// Prefix of event fields in the journal, followed by `_`.
 const JOURNAL_PREFIX: &str = "ECOD";
 
-/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides `level`. Spans are not
-/// logged: a line has the fields of its event only. Keep the result until the program ends.
+/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides
+/// `level`. Spans are not logged: a line has the fields of its event only. Keep the result until
+/// the program ends.
 pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let (layer, problem) = match resolved(format, is_service) {
@@ -113,7 +115,8 @@ fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
     }
 }
 
-/// True if standard error is connected to the journal. The variable alone may be inherited from another process.
+/// True if standard error is connected to the journal. The variable alone may be inherited from
+/// another process.
 fn stderr_is_journal() -> bool {
     let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else {
         return false;
@@ -122,7 +125,7 @@ fn stderr_is_journal() -> bool {
         .is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
 }
 
-/// An export that this program was built without.
+/// An export in a program that was built without it.
 #[cfg(not(feature = "otel"))]
 pub enum Export {}
 

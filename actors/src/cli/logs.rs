@@ -21,12 +21,13 @@ pub(super) struct LogsNodeArguments {
 /// Files of one node's log, in order.
 pub(super) struct Logs {
     pub(super) files: Vec<PathBuf>,
-    /// Error of the first file whose configuration is unknown.
+    /// Error of the first file without a configuration.
     pub(super) unusable: Option<LogError>,
 }
 
 impl Logs {
-    /// Finds the log files of one node among files and directories. Files without a node's name belong to the only node.
+    /// Finds the log files of one node among files and directories. Files without a node's name
+    /// belong to the only node.
     pub(super) fn find(
         inputs: &[PathBuf],
         LogsNodeArguments { node }: &LogsNodeArguments,

@@ -25,7 +25,8 @@ pub(super) enum PkiCommand {
         /// Name of the cell
         #[arg(long)]
         cell: NodeName,
-        /// Directory of the CA of the city that signs the cell's CA; by default the cell stands alone
+        /// Directory of the CA of the city that signs the cell's CA; by default the cell stands
+        /// alone
         #[arg(long, value_name = "DIR")]
         city: Option<PathBuf>,
     },
@@ -35,7 +36,8 @@ pub(super) enum PkiCommand {
         ca: AuthorityDir,
         /// Name of the node
         node: NodeName,
-        /// Highest role of the node, its key `role`; with `cav` it can never lead, with `auto` not as an edge
+        /// Highest role of the node, its key `role`; with `cav` it cannot lead, with `auto` not as
+        /// an edge
         #[arg(long, default_value = "auto", value_parser = ["auto", "cav", "edge"])]
         role: String,
         /// Highest priority of the node in the election, its key `election.priority`
@@ -55,7 +57,7 @@ pub(super) enum PkiCommand {
         /// Name of the node
         node: NodeName,
     },
-    /// Certificates of a city, whose vehicles take part in all its cells
+    /// Certificates of a city, whose vehicles are members of all its cells
     #[command(subcommand)]
     City(CityCommand),
 }
@@ -88,7 +90,7 @@ pub(super) enum CityCommand {
         /// Name of the vehicle
         #[arg(required_unless_present = "cell")]
         vehicle: Option<NodeName>,
-        /// Name of a cell whose CA, and all that it has certified, counts no more
+        /// Name of a cell whose CA becomes invalid, with all its certificates
         #[arg(long, conflicts_with = "vehicle")]
         cell: Option<NodeName>,
     },
@@ -207,7 +209,7 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
     })
 }
 
-/// The CA of a cell or, if so wanted, a city in a directory.
+/// The CA of a cell or, if `is_city`, of a city in a directory.
 fn open(directory: &Path, is_city: bool) -> Result<Authority, Failure> {
     let authority = Authority::open(directory).map_err(failure)?;
     authority.check_is_city(is_city).map_err(failure)?;
@@ -218,7 +220,7 @@ fn validity(days: u32) -> Duration {
     Duration::from_secs(u64::from(days) * 86_400)
 }
 
-/// The role of a flag, whose value is one of the three.
+/// The role of a flag with one of the three values.
 pub(super) fn role_named(name: &str) -> Role {
     match name {
         "cav" => Role::Cav,

@@ -40,10 +40,11 @@ pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
             )));
         }
     };
-    // A node runs on without its log, but a recorder has nothing else to do.
+    // A node continues without its log, but for a recorder the log is the only purpose.
     std::fs::create_dir_all(&record.dir)
         .with_context(|| format!("cannot record to {}", record.dir.display()))?;
-    // A name with the process id would start a new log in every run, which no later run continues or deletes.
+    // A name with the process id would start a new log in every run, and no later run would
+    // continue or delete it.
     let name = Some(arguments.observer.name().cloned().unwrap_or(NAME));
     config.record = Some(RecordConfig {
         name,

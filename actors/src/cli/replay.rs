@@ -24,12 +24,12 @@ use log::LogReplay;
 /// Flags of `replay`.
 #[derive(Debug, Args)]
 pub(super) struct ReplayArguments {
-    /// Configuration of the cell or of one of its nodes (TOML). Default: that of the log; for reports, the defaults and
-    /// the locations that the reports name
+    /// Configuration of the cell or of one of its nodes (TOML). Default: the configuration in the
+    /// log; for reports, the defaults and the locations that the reports name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A log (MCAP), a directory of logs, or reports, one JSON object per line in order of arrival; `-` for standard
-    /// input; may be given several times for logs
+    /// A log (MCAP), a directory of logs, or reports, one JSON object per line in order of arrival;
+    /// `-` for standard input; may be given several times for logs
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
     #[command(flatten)]
@@ -40,8 +40,9 @@ pub(super) struct ReplayArguments {
     /// Weigh all recorded votes together N times, and write the last verdicts only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
-    /// Share of rejected reports beyond which the program ends with code 3, as it does if no report was usable, most votes do not
-    /// count, or no object is at a known location
+    /// Share of rejected reports in percent beyond which the program ends with code 3. It also does
+    /// so if no report was usable, most votes were ignored, or all objects are away from the
+    /// landmarks
     #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u64).range(0..=100), default_value_t = 10)]
     max_rejected: u64,
 }
@@ -79,7 +80,7 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     usable.map_or(Ok(()), |usable| usable.check(*max_rejected))
 }
 
-/// The input, if it is a file of lines or standard input; none for logs.
+/// The input, if it is a file of lines or standard input; `None` for logs.
 fn input_of_lines<'a>(
     inputs: &'a [PathBuf],
     node: &LogsNodeArguments,
@@ -99,7 +100,7 @@ fn input_of_lines<'a>(
     Ok(Some(input))
 }
 
-/// Replays lines; gives nothing if the reader of the output closed it.
+/// Replays lines; returns `None` if the reader of the output closed it.
 fn replay_lines(
     config: ReplayConfig,
     input: &Path,
@@ -128,13 +129,13 @@ fn replay_lines(
     Ok(Some(Usable::of(&summary, false)))
 }
 
-/// Counts of reports, to tell input of another kind, or damaged input, from a recording.
+/// Counts of reports, to distinguish a recording from other or damaged input.
 #[derive(Debug, Clone, Copy, Default)]
 struct Usable {
     reports: u64,
     used: u64,
     faulty: u64,
-    /// Objects for VOTE, and those of them that did not count.
+    /// Objects for VOTE, and the number of them that were ignored.
     votes: u64,
     ignored_votes: u64,
     placed: u64,
@@ -183,7 +184,8 @@ impl Usable {
         }
     }
 
-    /// Fails if no report was used, or none has an effect, or more than a share was rejected.
+    /// Fails if no report was used, if the reports have no effect, or if more than the given share
+    /// was rejected.
     fn check(self, max_rejected_pct: u64) -> Result<(), Failure> {
         let Self {
             reports,
@@ -225,7 +227,7 @@ impl Usable {
 /// The cell that a configuration file describes; without a file, an open one.
 ///
 /// # Errors
-/// When the file cannot be used.
+/// Returns an error if the file cannot be used.
 pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     let Some(path) = path else {
         return Ok(ReplayConfig::default());

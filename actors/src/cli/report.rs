@@ -11,7 +11,7 @@ use super::{Failure, elsewhere};
 use crate::cli::lines;
 use crate::observe::report::Report;
 
-/// Which log becomes a page, and where.
+/// Input logs of a page, and its output file.
 #[derive(Debug, Args)]
 pub struct PageArguments {
     /// Log files of one node (MCAP) in order, or their directory
@@ -41,11 +41,11 @@ pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     page(&arguments.page, Report::default(), None, "ecod-node")
 }
 
-/// Gathers the log into `report` and writes its page. The page must not be the file `read`, which the caller has read;
-/// problems are told of as `program`.
+/// Gathers the log into `report` and writes its page. The page must not be the file `read`, which
+/// the caller has read. Problems are printed under the name `program`.
 ///
 /// # Errors
-/// When there is no log of one node, or the page cannot be written.
+/// Returns an error if there is no log of one node, or the page cannot be written.
 pub fn page(
     arguments: &PageArguments,
     mut report: Report,

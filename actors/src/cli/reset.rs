@@ -1,4 +1,4 @@
-//! `ecod-node reset`: forgets the evidence about vehicles, or the highest term.
+//! `ecod-node reset`: drops the evidence about vehicles, the highest term, or the description.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -19,13 +19,13 @@ pub(super) struct ResetArguments {
     /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Forget the evidence behind the reputations. In a cell without certificates all nodes forget it
+    /// Drop the evidence behind the reputations. In a cell without certificates all nodes drop it
     #[arg(long, group = "what")]
     reputations: bool,
-    /// Forget the highest term of leadership
+    /// Drop the highest term of leadership
     #[arg(long, group = "what")]
     term: bool,
-    /// Forget the description of the cell. The node learns it again from others that have it
+    /// Drop the description of the cell. The node receives it again from other nodes that have it
     #[arg(long, group = "what")]
     description: bool,
 }

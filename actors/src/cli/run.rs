@@ -32,7 +32,7 @@ use crate::transport::pki::OBSERVER_MARK;
 /// Flags of a node; each overrides the key of its name in the configuration file.
 #[derive(Debug, Default, Args)]
 pub(super) struct RunArguments {
-    /// When to lead: `edge` whenever possible, `auto` without a better candidate, `cav` never
+    /// When to lead: `edge` whenever possible, `auto` without a better candidate, `cav` not at all
     #[arg(long, value_parser = ["auto", "cav", "edge"])]
     role: Option<String>,
     #[command(flatten)]
@@ -43,17 +43,17 @@ pub(super) struct RunArguments {
     /// Directory for state that survives a restart
     #[arg(long, value_name = "DIR")]
     state_dir: Option<String>,
-    /// Description of the cell (TOML) with which this node starts a cell that has none
+    /// Description of the cell (TOML) with which this node starts a new cell
     #[arg(long, value_name = "FILE")]
     description: Option<String>,
     /// Append every accepted map with its time of receipt to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     map_log: Option<String>,
-    /// Address of the web page, metrics and health. Default 127.0.0.1:8080, or a free port if that is in use. Addresses
-    /// other than loopback need `dashboard.token`
+    /// Address of the web page, metrics and health. Default 127.0.0.1:8080, or a free port if that
+    /// is in use. Addresses other than loopback need `dashboard.token`
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1)]
     dashboard: Option<Option<SocketAddr>>,
-    /// Serve neither page nor metrics nor health
+    /// Disable page, metrics and health
     #[arg(long, conflicts_with = "dashboard")]
     no_dashboard: bool,
     /// Record to this directory (MCAP); the configuration table `record` has more options
@@ -65,7 +65,7 @@ pub(super) struct RunArguments {
     /// With --print-config: print only what differs from the defaults
     #[arg(long, requires = "print_config")]
     changed: bool,
-    /// Stop when standard input ends, as when the parent process is gone
+    /// Stop when standard input ends, for example when the parent process ends
     #[arg(long, hide = true)]
     stop_at_eof: bool,
 }
@@ -114,8 +114,9 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     run_node(config, arguments.stop_at_eof)
 }
 
-/// Becomes the program without camera that a package has put beside this one, under the same process id and with the same
-/// arguments, so that no library of OpenCV is loaded. Returns where there is none.
+/// Replaces this process by the program without camera support that a package has installed next to
+/// this one, with the same process id and arguments, so that the libraries of OpenCV are not
+/// loaded. Returns if there is no such program.
 #[cfg(feature = "camera")]
 fn continue_without_opencv() {
     if let Some(program) = installed::path("lib/ecod-node/ecod-node") {
@@ -126,16 +127,16 @@ fn continue_without_opencv() {
     }
 }
 
-/// Runs a node until it is told to stop or gives up.
+/// Runs a node until it is stopped or gives up.
 pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Failure> {
     run_to_end(serve(config, stop_at_eof))
 }
 
-/// Runs what serves one node or several, on threads of its own.
+/// Runs `serve`, which runs one or several nodes, on its own threads.
 pub(super) fn run_to_end(serve: impl Future<Output = anyhow::Result<()>>) -> Result<(), Failure> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
     let served = runtime.block_on(serve);
-    // A detector may block for good; a restart of the node must not wait for it.
+    // A detector may block forever; a restart of the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
     Readers::of_process().wait_for_end(SHUTDOWN_TIMEOUT);
@@ -189,7 +190,8 @@ impl RunArguments {
     }
 }
 
-/// Leaves what was stated. A table without keys would hide that a file has something else in its place.
+/// Removes null values, so that only stated keys remain. A table without keys would hide that a
+/// file has another value in its place.
 fn remove_nulls(value: &mut Value) {
     if let Value::Object(keys) = value {
         keys.values_mut().for_each(remove_nulls);
@@ -229,7 +231,8 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Flags of a program that joins a cell as an observer. The configuration may be that of any node of the cell.
+/// Flags of a program that joins a cell as an observer. The configuration may belong to any node of
+/// the cell.
 #[derive(Debug, Args)]
 pub(super) struct ObserverArguments {
     #[command(flatten)]
@@ -242,8 +245,9 @@ impl ObserverArguments {
         self.join.name.as_ref()
     }
 
-    /// Configuration of a node that only listens: it never leads, has no camera, keeps no state, and leaves the addresses
-    /// in the file to their node. Its default name is made of `purpose` and the process id.
+    /// Configuration of a node that only observes: it cannot lead, has no camera, keeps no state,
+    /// and does not use the addresses in the file. Its default name is made of `purpose` and the
+    /// process id.
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
         let default_name = format!("{purpose}-{}", std::process::id());
         let name = self

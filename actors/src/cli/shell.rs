@@ -1,4 +1,5 @@
-//! `ecod-node completions` and `ecod-node man`: files that a package installs beside the program.
+//! `ecod-node completions` and `ecod-node man`: files that a package installs together with the
+//! program.
 
 use std::fs;
 use std::path::PathBuf;

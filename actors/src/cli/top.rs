@@ -38,7 +38,7 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     let mut config = arguments.observer.load("top")?;
     config.record = None;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
-    // From now on, so that the node never ends without having left.
+    // Created before the node starts, so that the node always leaves the cell before it ends.
     let gone = {
         let _context = runtime.enter();
         [SignalKind::hangup(), SignalKind::terminate()].map(signal)
@@ -48,7 +48,7 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
         .map_err(|error| anyhow!(error))?;
     let node = Arc::new(Mutex::new(Some(node)));
     let shown_node = Arc::clone(&node);
-    // Reading from a terminal that is gone never ends: this thread is not waited for then.
+    // Reading from a closed terminal may block forever: in that case this thread is not waited for.
     let drawing = runtime.spawn_blocking(move || draw_until_quit(&shown_node, &config));
     let shown = runtime.block_on(async {
         tokio::select! {
@@ -63,7 +63,7 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     Ok(shown?)
 }
 
-/// Waits until the terminal is closed, or the program is told to end, and leaves the terminal as it was.
+/// Waits until the terminal is closed, or the program is terminated, and restores the terminal.
 async fn terminal_gone([hangup, terminate]: [std::io::Result<Signal>; 2]) -> std::io::Result<()> {
     let (mut hangup, mut terminate) = (hangup?, terminate?);
     let is_closed = tokio::select! {
@@ -76,7 +76,7 @@ async fn terminal_gone([hangup, terminate]: [std::io::Result<Signal>; 2]) -> std
     discard_output()
 }
 
-/// Takes the terminal over, and gives it back if it is still there.
+/// Takes over the terminal, and restores it if it still exists.
 fn draw_until_quit(node: &Mutex<Option<NodeHandle>>, config: &NodeConfig) -> std::io::Result<()> {
     let is_gone = || !std::io::stdout().is_terminal();
     let shown = ratatui::try_init().and_then(|mut terminal| {
@@ -89,7 +89,7 @@ fn draw_until_quit(node: &Mutex<Option<NodeHandle>>, config: &NodeConfig) -> std
     }
 }
 
-/// Lets later output go nowhere: writing to a terminal that is gone fails.
+/// Discards later output, because writing to a closed terminal fails.
 fn discard_output() -> std::io::Result<()> {
     let nowhere = File::options().write(true).open("/dev/null")?;
     rustix::stdio::dup2_stderr(&nowhere)?;

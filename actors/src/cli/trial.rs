@@ -1,4 +1,5 @@
-//! `ecod-node try`: a cell from one's own pictures, without a configuration, or from those of a street.
+//! `ecod-node try`: a cell from the user's own pictures, without a configuration, or from the
+//! pictures of a street.
 
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
@@ -31,10 +32,10 @@ use crate::telemetry::counters::Event;
 /// Flags of `try`.
 #[derive(Debug, Args)]
 pub(super) struct TryArguments {
-    /// Video files, played again and again
+    /// Video files, played repeatedly
     #[arg(long, value_name = "FILE", num_args = 1..)]
     video: Vec<PathBuf>,
-    /// Directories of images, shown again and again in the order of their names
+    /// Directories of images, shown repeatedly in the order of their names
     #[arg(long, value_name = "DIR", num_args = 1..)]
     images: Vec<PathBuf>,
     /// Numbers of cameras of this machine, 0 for /dev/video0
@@ -43,26 +44,28 @@ pub(super) struct TryArguments {
     /// Addresses of network cameras, such as rtsp://192.168.1.20/stream1
     #[arg(long, value_name = "URL", num_args = 1..)]
     url: Vec<String>,
-    /// Write the configuration that is used; those of further vehicles are numbered, as in node-2.toml
+    /// Write the configuration that is used; the files of further vehicles are numbered, as in
+    /// node-2.toml
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in use
+    /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in
+    /// use
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     dashboard: Option<SocketAddr>,
-    /// Stop when standard input ends, as when the parent process is gone
+    /// Stop when standard input ends, for example when the parent process ends
     #[arg(long, hide = true)]
     stop_at_eof: bool,
 }
 
-/// Distance in metres between vehicles: nothing is known of where they stand, and none must take another's objects for
-/// its own.
+/// Distance in metres between vehicles: their true positions are unavailable, and a vehicle must
+/// not take another's objects for its own.
 const SPACING_M: f64 = 50.0;
 
 /// The street, below the prefix of an installed program and in the sources.
 const STREET_INSTALLED: &str = "share/ecod-node/street";
 const STREET_IN_SOURCES: &str = "examples/street";
 
-/// Guessed height of the camera in metres, between that on a dashboard and that in a hand.
+/// Assumed height of the camera in metres, between the heights of a dashboard and of a hand.
 const CAMERA_HEIGHT_M: f64 = 1.5;
 
 /// Time between two figures of progress.
@@ -81,7 +84,7 @@ impl TryArguments {
     /// The frame sources with the names of their vehicles.
     fn sources(&self) -> Vec<(String, SourceConfig)> {
         let numbered = |kind: &str, index: usize| format!("{kind}-{}", index + 1);
-        // A saved configuration is to be of use in every directory.
+        // A saved configuration should work in every directory.
         let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
         let videos = self.video.iter().enumerate().map(|(index, path)| {
             (
@@ -123,7 +126,8 @@ impl TryArguments {
         videos.chain(images).chain(cameras).chain(urls).collect()
     }
 
-    /// The configurations of the vehicles. The others are told of the first once it runs.
+    /// The configurations of the vehicles. The other vehicles get the first vehicle's address once
+    /// it runs.
     fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
         let sources = self.sources();
         let mut configs = Vec::new();
@@ -215,7 +219,7 @@ fn street() -> anyhow::Result<Vec<NodeConfig>> {
     files.iter().map(node).collect()
 }
 
-/// Makes a node of this process part of its own cell only, at addresses that nobody else has.
+/// Isolates a node of this process in a cell of its own, at unused addresses.
 fn apart(config: &mut NodeConfig) {
     config.cell = NodeName::from_static("try");
     config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
@@ -223,8 +227,8 @@ fn apart(config: &mut NodeConfig) {
     config.membership.multicast.enabled = false;
 }
 
-/// A vehicle that stands at the origin, with guesses for all that nobody said. The errors of the guesses count in the
-/// covariance of its objects.
+/// A vehicle that stands at the origin, with default guesses for all unstated values. The
+/// covariance of its objects includes the errors of the guesses.
 fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
     let camera = CameraConfig {
         name: None,
@@ -245,7 +249,7 @@ fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
         view: ViewConfig::default(),
         votes: false,
     };
-    // A camera in a hand is no car, and things may be close to it.
+    // A hand-held camera is not a car, and objects may be close to it.
     let tracks = TracksConfig {
         vehicle_radius_m: 0.1,
         vehicle_label: Label::new_static("camera"),
@@ -350,7 +354,7 @@ fn numbered(path: &Path, index: usize) -> PathBuf {
     path.with_file_name(format!("{stem}-{}{extension}", index + 1))
 }
 
-/// Tells of progress until a node gives up.
+/// Reports progress until a node gives up.
 async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
     let sum = |nodes: &[NodeHandle], event| {
         nodes

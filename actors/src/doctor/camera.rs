@@ -46,7 +46,7 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
         _ => "set `camera.source` to an existing source",
     };
     let source = camera.source.clone();
-    // A camera that blocks forever keeps its thread, but the program ends all the same.
+    // A camera that blocks forever keeps its thread, but the program ends nevertheless.
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         // The receiver is gone after the timeout.
@@ -95,7 +95,7 @@ fn calibration(camera: &CameraConfig) -> Finding {
     }
 }
 
-/// Loads the detector, runs it on a frame, and places what it finds.
+/// Loads the detector, runs it on a frame, and places its detections.
 async fn detections(
     config: &NodeConfig,
     camera: &CameraConfig,

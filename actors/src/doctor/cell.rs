@@ -1,4 +1,5 @@
-//! Check of the way to the cell: the node looks on for a moment, with its key and certificate.
+//! Check of the connection to the cell: the node observes it for a moment, with its key and
+//! certificate.
 
 use std::io::ErrorKind;
 use std::net::UdpSocket;
@@ -17,11 +18,12 @@ use crate::transport::gossip::Member;
 /// Time in which a leader is found, if there is one.
 const PATIENCE: Duration = Duration::from_secs(4);
 
-/// Time for which an observer that follows looks on: greetings of other cells and the cell's time come within it.
+/// Time for which an observer that follows a leader stays: greetings of other cells and the cell's
+/// time arrive within it.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Checks that nodes of the cell answer, and compares this machine's clock with theirs. Where no other node could be
-/// found, nothing is checked.
+/// Checks that nodes of the cell answer, and compares this machine's clock with theirs. If no other
+/// node was found, this check is skipped.
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     let membership = &config.membership;
     if membership.seeds.is_empty() && !membership.multicast.enabled {

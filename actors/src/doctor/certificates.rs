@@ -1,4 +1,5 @@
-//! Checks of the node's certificates and their expiry, in its own cell and in those to which it moves.
+//! Checks of the node's certificates and their expiry, in its own cell and in the cells to which it
+//! moves.
 
 use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
@@ -52,7 +53,7 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
         identity.name(),
         left.as_secs() / 86_400
     );
-    // Programs beside the node may have it by their group.
+    // Local programs may have read access through their group.
     let is_public = std::fs::metadata(&files.key)
         .is_ok_and(|metadata| metadata.permissions().mode() & 0o037 != 0);
     Some(if left.is_zero() {
@@ -111,7 +112,7 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     })
 }
 
-/// Checks that a vehicle that moves on can take part in each cell.
+/// Checks that a vehicle that moves between cells can join each of them.
 pub(super) fn cells(config: &NodeConfig) -> Option<Finding> {
     let (check, path) = ("cells", config.cells.as_ref()?);
     let cells = match config.load_cells() {

@@ -13,8 +13,8 @@ const MARKS: [&str; 2] = [
     "/run/chrony/chronyd.pid",
 ];
 
-/// State of the service that keeps the clock. Aggregators estimate clock offsets, but larger ones cost accuracy, and they
-/// reject reports beyond `fusion.window.max_clock_offset_s`.
+/// State of the service that keeps the clock. Aggregators estimate clock offsets, but larger ones
+/// cost accuracy, and they reject reports beyond `fusion.window.max_clock_offset_s`.
 pub(super) fn synchronised() -> Finding {
     let fix = "run a time service, such as `apt install chrony` or `timedatectl set-ntp true`";
     match kernel_state() {

@@ -116,7 +116,7 @@ pub(super) fn gossip(config: &NodeConfig) -> Finding {
     }
 }
 
-/// Checks that the seeds have addresses. Sends nothing, as the seeds may be offline.
+/// Checks that the seeds have addresses. Sends no packets, because the seeds may be offline.
 pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
     let ipv4 = config.membership.bind.is_none_or(|bind| bind.is_ipv4());
     let mut findings = Vec::new();
@@ -213,7 +213,7 @@ impl Port {
         Finding::broken(check, format!("{address}: {}", describe(&error)), fix)
     }
 
-    /// The same where a free port will do, except for the reason `unless`.
+    /// As `of`, for a port that may be replaced by a free one, except for the reason `unless`.
     fn or_another<T>(self, bound: io::Result<T>, unless: &str) -> Finding {
         let Self {
             check,

@@ -13,7 +13,8 @@ use crate::transport::gossip::{KeyError, check_key};
 /// Minimum free bytes for state and map log.
 const MIN_FREE_BYTES: u64 = 100_000_000;
 
-/// Configuration directory of the packaged service, and the only directory that its unit lets it write by default.
+/// Configuration directory of the packaged service, and the only directory that its unit lets it
+/// write by default.
 const SERVICE_CONFIGURATION: &str = "/etc/ecod";
 const SERVICE_STATE: &str = "/var/lib/ecod";
 
@@ -113,7 +114,8 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
     findings
 }
 
-/// Checks that the packaged service writes only what its unit allows. The user who runs this check may have more rights.
+/// Checks that the packaged service writes only to paths that its unit allows. The user who runs
+/// this check may have more rights.
 pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     if !absolute(file).starts_with(SERVICE_CONFIGURATION) {
         return Vec::new();

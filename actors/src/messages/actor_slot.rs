@@ -8,8 +8,8 @@ use ractor::rpc::CallResult;
 use ractor::{ActorRef, Message, RpcReplyPort};
 use tokio::time::timeout;
 
-/// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A message to an empty
-/// slot is dropped, as it would be by an actor that has just ended.
+/// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A
+/// message to an empty slot is dropped, as it would be by an actor that has just ended.
 pub struct ActorSlot<M> {
     actor: Arc<RwLock<Option<ActorRef<M>>>>,
 }
@@ -33,8 +33,8 @@ impl<M: Message> ActorSlot<M> {
         self.get().is_some_and(|actor| actor.cast(message).is_ok())
     }
 
-    /// The answer of the present run, if it comes within so many times [`ANSWER_STEP`]. A stop of the whole node takes up
-    /// one step only.
+    /// The answer of the current run, if it arrives within `steps` times [`ANSWER_STEP`]. A stall
+    /// of the whole node takes up one step only.
     pub(crate) async fn ask<T: Send + 'static>(
         &self,
         question: impl FnOnce(RpcReplyPort<T>) -> M,
@@ -113,7 +113,7 @@ pub(crate) mod listening {
         }
     }
 
-    /// The slot, and what is sent to it.
+    /// The slot, and a receiver of the messages sent to it.
     pub(crate) async fn slot<M: Message>() -> (ActorSlot<M>, UnboundedReceiver<M>) {
         let (sender, receiver) = unbounded_channel();
         let slot = ActorSlot::default();
@@ -163,7 +163,7 @@ mod tests {
             let BrokerMessage::Health { reply } = message else {
                 return Ok(());
             };
-            // On a runtime of one thread nothing else goes on either.
+            // On a runtime with one thread, all other tasks stop as well.
             std::thread::sleep(Duration::from_millis(1500));
             tokio::time::sleep(Duration::from_millis(20)).await;
             reply.send(BrokerHealth::Stopped)?;

@@ -1,4 +1,4 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `Broker`, from the supervisor and from health checks.
 
 use std::net::SocketAddr;
 

@@ -1,4 +1,5 @@
-//! Requests to the actor `DescriptionKeeper`, from the election, the gateway and the node's local broker.
+//! Requests to the actor `DescriptionKeeper`, from the election, the gateway and the node's local
+//! broker.
 
 use std::sync::Arc;
 
@@ -10,9 +11,9 @@ use crate::transport::mqtt::Delivery;
 /// Requests to the keeper of the cell's description.
 #[derive(Debug)]
 pub enum DescriptionKeeperMessage {
-    /// Take the authenticated word of a node about its description.
+    /// Process a node's authenticated statement about its description.
     Hear {
-        /// The node.
+        /// Name of the node.
         from: NodeName,
         /// True if it may lead.
         may_lead: bool,
@@ -23,7 +24,7 @@ pub enum DescriptionKeeperMessage {
     },
     /// Take a description from a broker.
     Take {
-        /// The description and the way that it came.
+        /// The description and its path of delivery.
         delivery: Delivery<Arc<CellDescription>>,
     },
     /// Set the cell's description, which was checked.
@@ -33,6 +34,6 @@ pub enum DescriptionKeeperMessage {
     },
     /// Publish to a broker that has just accepted a link.
     Connected,
-    /// Repeat what others lack, and try the disk again.
+    /// Repeat messages that other nodes still lack, and try the disk again.
     Tick,
 }

@@ -11,17 +11,17 @@ use crate::transport::mqtt::Delivery;
 pub enum FollowerMessage {
     /// A map.
     TakeMap {
-        /// The map and when it came.
+        /// The map and its time of receipt.
         delivery: Delivery<Arc<GlobalMap>>,
     },
     /// Verdicts.
     TakeVerdicts {
-        /// The verdicts and when they came.
+        /// The verdicts and their time of receipt.
         delivery: Delivery<Arc<Verdicts>>,
     },
     /// Reputations.
     TakeReputations {
-        /// The reputations and when they came.
+        /// The reputations and their time of receipt.
         delivery: Delivery<Arc<Reputations>>,
     },
 }

@@ -1,4 +1,5 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `Fuser`, from the follower, the uplink, the election and the keeper of
+//! reputations.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,14 +20,15 @@ use ractor::RpcReplyPort;
 pub enum FuserMessage {
     /// Fuse the reports that wait in its queue.
     TakeReports,
-    /// Keep another aggregator's map, which the follower's gate admitted, to go on from when leading.
+    /// Keep another aggregator's map, which the follower accepted, to continue from it when
+    /// leading.
     TakeMap {
         /// The map.
         map: Arc<GlobalMap>,
-        /// When it came.
+        /// Time of receipt.
         received_at: Timestamp,
     },
-    /// Do not go on from a map of this aggregator: it is not trusted any more.
+    /// Do not continue from a map of this aggregator, because it is not trusted any more.
     ForgetMap {
         /// The aggregator.
         of: NodeName,
@@ -35,15 +37,15 @@ pub enum FuserMessage {
     TakeNeighbours {
         /// All that are near this cell; their times are by this node's clock.
         objects: Arc<[NeighbourObject]>,
-        /// When they were of the age that they state.
+        /// Time at which the objects had the ages that they state.
         stated_at: Timestamp,
     },
-    /// Start vehicles from what other cells say of them.
+    /// Derive the initial reputation of vehicles from other cells' counts.
     TakeForeign {
-        /// All that they say of the vehicles that are present.
+        /// All counts of other cells about the present vehicles.
         reputations: Arc<ForeignReputations>,
     },
-    /// Tell the uplink anew which vehicles are present.
+    /// Send the set of present vehicles to the uplink again.
     TellUplink,
     /// Close the round if it is due.
     CloseRound,
@@ -56,23 +58,24 @@ pub enum FuserMessage {
         /// When it is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole length: another node is about to lead from the next one on.
+    /// Let the current round last its full length: another node is about to lead from the next one
+    /// on.
     HoldRound,
-    /// Publish nothing more; go on fusing, to be ready.
+    /// Stop publishing; continue to fuse, to be ready.
     StopPublishing,
-    /// Go on under other settings.
+    /// Continue with other settings.
     Configure {
         /// Settings of fusion.
         fusion: Box<FusionConfig>,
-        /// Known locations.
+        /// The cell's landmarks.
         landmarks: Vec<LandmarkConfig>,
     },
-    /// Start from evidence that came from elsewhere.
+    /// Start from evidence of another source.
     Adopt {
-        /// All evidence that is known.
+        /// All available evidence.
         ledger: Arc<ReputationLedger>,
     },
-    /// Go on, in VOTE's `paper` mode, from reputations that were published.
+    /// Continue, in VOTE's `paper` mode, from published reputations.
     Resume {
         /// The reputations.
         reputations: BTreeMap<NodeName, Reputation>,

@@ -1,4 +1,4 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `Gateway`, from all actors that publish.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,13 +18,14 @@ pub enum GatewayMessage {
         /// The brokers, in no particular order.
         addresses: Vec<BrokerAddress>,
     },
-    /// Subscribe to reports on these brokers only, for new connections. Before it, a candidate does so on all brokers.
+    /// Subscribe to reports only on these brokers, for new connections. Before this message, a
+    /// candidate subscribes on all brokers.
     SetReportBrokers {
         /// Brokers to which all vehicles publish.
         addresses: Vec<BrokerAddress>,
     },
-    /// Subscribe to reports on every broker for display, or end that. It is repeated from time to time, as a restarted
-    /// gateway has forgotten it.
+    /// Start or stop subscribing to reports on every broker for display. The message is repeated
+    /// from time to time, because a restarted gateway has lost it.
     WatchReports {
         /// True if they are wanted.
         wanted: bool,

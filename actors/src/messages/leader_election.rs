@@ -1,4 +1,4 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `LeaderElection`, from membership, gateway and the node's other parts.
 
 use std::sync::Arc;
 
@@ -11,14 +11,14 @@ use crate::transport::mqtt::Delivery;
 /// Messages to the election.
 #[derive(Debug)]
 pub enum LeaderElectionMessage {
-    /// The membership found something out, or brought a message.
+    /// The membership detected a change, or received a message.
     Membership {
         /// The news.
         event: MembershipEvent,
     },
-    /// A broker passed on a status.
+    /// A broker forwarded a status.
     TakeStatus {
-        /// Another node's status, or its last will, and its place among what waits.
+        /// Another node's status, or its last will, and its place in the queue.
         delivery: Delivery<Arc<NodeStatus>>,
     },
     /// Something else happened at the node.

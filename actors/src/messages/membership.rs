@@ -1,4 +1,4 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `Membership`, from the election and from the membership itself.
 
 use std::net::SocketAddr;
 
@@ -26,7 +26,8 @@ pub enum MembershipMessage {
         /// The seeds, resolved.
         addresses: Vec<SocketAddr>,
     },
-    /// Read changed certificates, and end sessions whose certificate is no longer valid; sent by the membership to itself.
+    /// Read changed certificates, and end sessions with an expired or revoked certificate; sent by
+    /// the membership to itself.
     CheckCertificates,
     /// Process waiting datagrams and due timers; sent by the membership to itself.
     Wake,

@@ -7,17 +7,17 @@ use ecod::wire::{GlobalMap, Reputations, Verdicts};
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
-/// A message and when it came.
+/// A message and its time of receipt.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Received<T> {
-    /// When it came, by this node's clock.
+    /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
     /// The message.
     pub message: Arc<T>,
 }
 
-/// Where the newest of everything is seen as it changes.
+/// Watches of the newest messages of each kind.
 #[derive(Debug, Clone)]
 pub struct Newest {
     /// The newest map.
@@ -39,10 +39,10 @@ impl Default for Newest {
     }
 }
 
-/// A map and when it came; one line of a map log.
+/// A map and its time of receipt; one line of a map log.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReceivedMap {
-    /// When it came, by this node's clock.
+    /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
     /// The map.

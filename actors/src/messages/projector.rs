@@ -24,11 +24,11 @@ pub enum ProjectorMessage {
         /// The frame, if browsers are to see it.
         shown: Option<CameraFrame>,
     },
-    /// Go on under other settings.
+    /// Continue with other settings.
     Configure {
-        /// Camera and known locations.
+        /// Camera and landmarks.
         perception: Box<Perception>,
-        /// The pose of a vehicle that stands still, if it is known.
+        /// The pose of a vehicle that stands still, if available.
         standing: Option<Pose>,
         /// The place of the cell's frame on Earth.
         origin: Option<GeographicOrigin>,

@@ -1,4 +1,5 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `ReputationKeeper`, from the fuser, the gateway, the election and the
+//! uplink.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,7 +21,7 @@ pub enum ReputationKeeperMessage {
         /// Number of the last round before it.
         last_round: u64,
     },
-    /// Record what a round of the node's own leadership says about vehicles.
+    /// Record the evidence about vehicles from a round of the node's own leadership.
     Record {
         /// The leadership.
         epoch: Epoch,
@@ -31,25 +32,25 @@ pub enum ReputationKeeperMessage {
         /// In VOTE's `paper` mode, the reputations after it.
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     },
-    /// Publish scores beside these votes of other cells.
+    /// Publish scores that include these votes of other cells.
     SetForeign {
         /// The round from which on they count.
         round: u64,
-        /// All votes of other cells, as they count here.
+        /// All votes of other cells, with their weight here.
         votes: BTreeMap<NodeName, ForeignVotes>,
     },
-    /// Tell the uplink all counts that other cells are told, and from now on what changes.
+    /// Send the uplink all counts for other cells, and later changes.
     TellUplink,
-    /// Publish nothing more.
+    /// Stop publishing.
     StepDown,
-    /// Go on with other parameters of reputations.
+    /// Continue with other parameters of reputations.
     Configure {
         /// The parameters.
         reputation: ReputationConfig,
     },
-    /// Take in another candidate's evidence.
+    /// Merge another candidate's evidence.
     Merge {
-        /// The share and when it came.
+        /// The share and its time of receipt.
         delivery: Delivery<Arc<LedgerShare>>,
     },
     /// Share all evidence: a node needs it to lead, or to remain the leader.
@@ -57,7 +58,7 @@ pub enum ReputationKeeperMessage {
         /// The node; other candidates get it too.
         to: NodeName,
     },
-    /// Save, publish and pass on what has changed.
+    /// Save, publish and distribute pending changes.
     Tick,
     /// Drop the evidence of nodes whose certificate was revoked.
     CheckCertificates,

@@ -1,4 +1,5 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `Uplink`, from the supervisor, the fuser, the keeper of reputations and
+//! its own link.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -13,35 +14,35 @@ use crate::transport::mqtt::{Delivery, FromRegion, LinkEvent};
 /// Messages to the uplink.
 #[derive(Debug)]
 pub enum UplinkMessage {
-    /// Look who leads and which map is the newest: one of them has changed.
+    /// Check the leader and the newest map: one of them has changed.
     Look,
     /// Publish this status of the node while it leads.
     SetStatus {
         /// The status.
         status: NodeStatus,
     },
-    /// Go on under other settings of the cell.
+    /// Continue with other settings of the cell.
     Configure {
         /// The place of the cell's frame on Earth.
         origin: Option<GeographicOrigin>,
         /// The description of the cell.
         description: Option<Arc<CellDescription>>,
     },
-    /// Ask the region about these vehicles, which are present in the cell, and about no others.
+    /// Subscribe to the counts of these vehicles, which are present in the cell, and only of these.
     SetPresent {
         /// All of them.
         vehicles: BTreeSet<NodeName>,
     },
-    /// Tell the region what the cell's own evidence says of vehicles.
+    /// Publish the cell's own counts about vehicles to the region.
     TellCounts {
         /// The vehicles whose counts have changed.
         counts: Vec<(NodeName, CellCounts)>,
     },
-    /// Take the next steps in telling and asking about vehicles.
+    /// Take the next steps in the exchange of counts about vehicles.
     Exchange,
     /// Take a message of the region.
     Take {
-        /// The message and when it came.
+        /// The message and its time of receipt.
         delivery: Delivery<FromRegion>,
     },
     /// An event of the link's own task.

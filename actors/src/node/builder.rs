@@ -57,11 +57,11 @@ use crate::transport::broker::Door;
 use crate::transport::gossip::{FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
-/// Materials of the parts; kept to make them again.
+/// Arguments of the parts; kept to create them again.
 pub(super) struct NodeBuilder {
     /// The node's own configuration.
     own_config: NodeConfig,
-    /// The same with the cell's description, as it is used.
+    /// The configuration including the cell's description, as in use.
     config: NodeConfig,
     presence: Presence,
     vehicle: VehicleParts,
@@ -210,7 +210,7 @@ impl NodeBuilder {
             .unwrap_or_else(none)
     }
 
-    /// Has running detectors record to this node's log, and trace their frames in its cell.
+    /// Makes running detectors record to this node's log, and trace their frames in its cell.
     pub(super) fn take_frames(&self) {
         self.vehicle.log.send_replace(self.recording.clone());
         self.vehicle.spans.send_replace(self.spans());
@@ -406,7 +406,7 @@ impl NodeBuilder {
 
     /// Stops all parts, the last started first.
     pub(super) async fn stop_all(&self) {
-        // Those of the vehicle may be another node's.
+        // The vehicle's parts may belong to another node.
         if self.presence >= Presence::Reporting {
             self.stop_vehicle().await;
         }
@@ -467,7 +467,7 @@ fn slot<M: Message>(
     Ok(id)
 }
 
-/// The same for one of the cameras.
+/// As `slot`, for a part of one of the cameras.
 #[cfg(feature = "camera")]
 fn camera_slot<M: Message>(
     slots: &[ActorSlot<M>],

@@ -15,10 +15,10 @@ use crate::camera::perception::{Perception, VehicleCamera};
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::{CameraSetup, ShownCamera};
 
-/// The pose of a vehicle that stands still; none where poses are received.
+/// The pose of a vehicle that stands still; `None` if poses are received.
 ///
 /// # Errors
-/// When it is on Earth, and has no place in the cell's frame.
+/// Returns an error if the pose is on Earth and has no place in the cell's frame.
 pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
     let is_used = config.has_camera() && config.pose.listen.is_none();
     let pose = is_used
@@ -27,10 +27,11 @@ pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
     pose.context("key `pose.latitude_deg`")
 }
 
-/// The way from a camera's detections to reports, as configured. Each frame has its own pose.
+/// The processing from a camera's detections to reports, as configured. Each frame has its own
+/// pose.
 ///
 /// # Errors
-/// When its calibration file cannot be used.
+/// Returns an error if the camera's calibration file cannot be used.
 pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<Perception> {
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
@@ -56,7 +57,7 @@ pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<
 /// A camera's lens.
 ///
 /// # Errors
-/// When its calibration file cannot be used.
+/// Returns an error if its calibration file cannot be used.
 pub fn lens(camera: &CameraConfig) -> anyhow::Result<Lens> {
     camera
         .optics
@@ -64,7 +65,8 @@ pub fn lens(camera: &CameraConfig) -> anyhow::Result<Lens> {
         .context("key `camera.optics.calibration`")
 }
 
-/// The algorithms that a camera's reports are for. Without known locations there is nothing to vote on.
+/// The algorithms that a camera's reports are for. Without landmarks there is no location to vote
+/// on.
 pub fn algorithms(config: &NodeConfig, camera: &CameraConfig) -> Algorithms {
     match config.fusion.algorithms {
         Algorithms::Both if !camera.votes || config.landmarks.is_empty() => Algorithms::Pace,
@@ -72,8 +74,8 @@ pub fn algorithms(config: &NodeConfig, camera: &CameraConfig) -> Algorithms {
     }
 }
 
-/// Time in which a frame source opens: less than the stall timeout, so that OpenCV gives up first and no reader is
-/// abandoned.
+/// Time in which a frame source opens: less than the stall timeout, so that OpenCV gives up first
+/// and no reader is abandoned.
 pub fn open_timeout(camera: &CameraConfig) -> Duration {
     Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s)
 }

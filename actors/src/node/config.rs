@@ -1,6 +1,8 @@
-//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then flags.
+//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then
+//! flags.
 //!
-//! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
+//! Environment variables name a key with two underscores between its levels:
+//! `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
 mod cameras;
 mod cells;
@@ -40,42 +42,46 @@ use crate::transport::gossip::MembershipConfig;
 use crate::transport::mqtt::{DataPlane, MqttConfig, Security, SecurityError};
 use crate::transport::pki::TlsConfig;
 
-/// Everything that a node can be told.
+/// All settings of a node.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NodeConfig {
-    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name for others.
+    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name
+    /// for others.
     pub name: Option<NodeName>,
-    /// Name of the cell; nodes of other cells are not heard. Default `cell`.
+    /// Name of the cell; messages of nodes of other cells are ignored. Default `cell`.
     pub cell: NodeName,
     /// The node's role. Default `auto`.
     pub role: Role,
-    /// Where the embedded broker listens. Default port 8883 on all interfaces with `[tls]`; without, port 1883 on
-    /// 127.0.0.1, where other machines do not reach it, unless `broker.allow_plaintext` says otherwise. A broker that is
-    /// only a door for programs takes a free port if that is taken.
+    /// Address at which the embedded broker listens. Default: with `[tls]`, port 8883 on all
+    /// interfaces; without, port 1883 on 127.0.0.1, which other machines cannot reach, unless
+    /// `broker.allow_plaintext` is set. A broker that only serves local programs takes a free port
+    /// if the default port is in use.
     pub listen: Option<SocketAddr>,
-    /// Directory for what survives a restart: reputations and the highest term of leadership. Default
-    /// `$STATE_DIRECTORY`, which systemd sets, or none: then reputations end with the node, and it learns the term from the
-    /// others.
+    /// Directory for state that survives a restart: reputations and the highest term of leadership.
+    /// Default `$STATE_DIRECTORY`, which systemd sets. Without either, reputations end with the
+    /// node, and it receives the term from the other nodes.
     pub state_dir: Option<PathBuf>,
-    /// The description of the cell with which a node that may lead starts a cell that has none. Default none.
+    /// The description of the cell with which a node that may lead starts a new cell. Default: not
+    /// set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub description: Option<PathBuf>,
-    /// A file to which every accepted map is appended with its time of receipt, one JSON
-    /// object a line. Default none.
+    /// A file to which every accepted map is appended with its time of receipt, one JSON object per
+    /// line. Default: not set.
     pub map_log: Option<PathBuf>,
-    /// Where the vehicle is. Default at the origin, looking east.
+    /// The vehicle's pose. Default at the origin, looking east.
     pub pose: PoseConfig,
-    /// A file with the cells between which the vehicle moves by its position. Default none: it stays in `cell`.
+    /// A file with the cells between which the vehicle moves by its position. Default: not set; the
+    /// vehicle stays in `cell`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cells: Option<PathBuf>,
-    /// Settings by which the nodes of the cell find and watch each other.
+    /// Settings with which the nodes of the cell find and monitor each other.
     pub membership: MembershipConfig,
     /// Election of the leader.
     pub election: ElectionConfig,
     /// MQTT connections.
     pub mqtt: MqttConfig,
-    /// The node's certificates; default none: brokers are spoken to in plaintext.
+    /// The node's certificates. Default: not set; connections to brokers are in plaintext.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls: Option<TlsConfig>,
     /// Limits of the embedded broker.
@@ -88,22 +94,23 @@ pub struct NodeConfig {
     pub reputations: ReputationKeeperConfig,
     /// A web page with the cell, metrics and health.
     pub dashboard: DashboardConfig,
-    /// The camera and what is made of its frames. Default none.
+    /// The camera and the processing of its frames. Default: not set.
     #[cfg(feature = "camera")]
     pub camera: Option<CameraConfig>,
-    /// Further cameras of the vehicle, each with a name. Default none.
+    /// Further cameras of the vehicle, each with a name. Default: empty.
     #[cfg(feature = "camera")]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<CameraConfig>,
-    /// The log of what the node takes. Default none.
+    /// The log of the messages that the node receives. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub record: Option<RecordConfig>,
-    /// The place of the cell's frame on Earth, the same on every node. Default none.
+    /// The place of the cell's frame on Earth, equal on every node. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub origin: Option<GeographicOrigin>,
-    /// The cell's known locations, the same on every node. Default none.
+    /// The cell's landmarks, equal on every node. Default: empty.
     pub landmarks: Vec<LandmarkConfig>,
-    /// Shared keys that are stated here, and not only by default: the cell's description may not contradict them.
+    /// Shared keys that are stated here, not just defaults: the cell's description must not
+    /// contradict them.
     #[serde(skip)]
     pub stated: StatedKeys,
 }
@@ -144,10 +151,10 @@ impl Default for NodeConfig {
 /// A configuration that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum LoadError {
-    /// The file is not there or cannot be read.
+    /// The file does not exist or cannot be read.
     #[error("cannot read configuration {path}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -163,7 +170,8 @@ pub enum LoadError {
 /// Last line of a configuration that `init` or `join` has written.
 pub(crate) const END_OF_CONFIGURATION: &str = "# end of node.toml";
 
-/// Checks that a configuration is a file with content, and not cut off: `init` and `join` say in the file how it ends.
+/// Checks that a configuration is a file with content, and not truncated: `init` and `join` write
+/// an end mark.
 fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
     let text = bounded_file::read_text(path);
     let text = text.map_err(|source| LoadError::Unreadable {
@@ -194,10 +202,11 @@ fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
 }
 
 impl NodeConfig {
-    /// Reads the file, if any, lays the environment and `flags` over it, and checks the result.
+    /// Reads the file, if any, applies the environment and `flags` on top of it, and checks the
+    /// result.
     ///
     /// # Errors
-    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    /// Returns a [`LoadError`] that names the file, or the key, the value and the allowed range.
     pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
         let mut stated = Figment::new();
         if let Some(path) = file {
@@ -223,11 +232,12 @@ impl NodeConfig {
         Ok(config)
     }
 
-    /// Reads what a file says about a cell, be it a description or a node's configuration: all keys are known, none is
-    /// required, and neither the environment nor flags play a part. Fusion and locations are checked.
+    /// Reads the settings of a cell from a file, which may be a description or a node's
+    /// configuration: all keys are accepted, all are optional, and the environment and flags are
+    /// ignored. Fusion and locations are checked.
     ///
     /// # Errors
-    /// [`LoadError`] naming the file, or the key, the value and what is allowed.
+    /// Returns a [`LoadError`] that names the file, or the key, the value and the allowed range.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
         let text = bounded_file::read_text(file);
         let text = text.map_err(|source| LoadError::Unreadable {
@@ -248,7 +258,8 @@ impl NodeConfig {
         Ok(config)
     }
 
-    /// The stated keys over the defaults, unchecked. Boxes of a neural detector have a default deviation of their own.
+    /// The stated keys over the defaults, unchecked. Boxes of a neural detector have their own
+    /// default deviation.
     fn of_keys(stated: &Figment) -> Result<Self, LoadError> {
         let mut defaults = Figment::from(Serialized::defaults(Self::default()));
         if stated
@@ -270,10 +281,10 @@ impl NodeConfig {
         Ok(config)
     }
 
-    /// Checks every value and that they fit together.
+    /// Checks every value, and the consistency of the values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.name.is_none() {
             return Err(ConfigError::new(
@@ -347,7 +358,8 @@ impl NodeConfig {
         LandmarkConfig::validate_all(&self.landmarks)
     }
 
-    /// Others than this machine reach a broker without certificates only if somebody wants that.
+    /// Checks that a broker without certificates is reachable for other machines only if this is
+    /// explicitly allowed.
     fn validate_listen(&self) -> Result<(), ConfigError> {
         let listen = self.broker_listen();
         let open = self.tls.is_none() && !self.broker.allow_plaintext && !listen.ip().is_loopback();
@@ -380,7 +392,7 @@ impl NodeConfig {
     /// The protection of links and payloads; the files that the configuration names are read.
     ///
     /// # Errors
-    /// [`SecurityError`] naming the file.
+    /// Returns a [`SecurityError`] that names the file.
     pub fn security(&self) -> Result<Security, SecurityError> {
         Security::load(
             self.tls.as_ref().zip(self.name.as_ref()),
@@ -404,12 +416,13 @@ impl NodeConfig {
         self.may_lead() && self.data_plane().embedded
     }
 
-    /// True if the node has a broker: for the cell, or only as a door for its programs.
+    /// True if the node has a broker: for the cell, or only for its local programs.
     pub fn has_broker(&self) -> bool {
         self.serves_nodes() || self.broker.door
     }
 
-    /// True if the broker takes a free port where the usual one is in use: only programs of this machine need it.
+    /// True if the broker takes a free port where the usual one is in use: only programs of this
+    /// machine need it.
     pub fn may_listen_at_any_port(&self) -> bool {
         self.listen.is_none() && !self.serves_nodes()
     }
@@ -421,7 +434,7 @@ impl NodeConfig {
         DataPlane { external, embedded }
     }
 
-    /// The cell's known locations.
+    /// The cell's landmarks.
     pub fn landmarks(&self) -> Vec<Landmark> {
         self.landmarks.iter().map(Landmark::from).collect()
     }
@@ -430,7 +443,7 @@ impl NodeConfig {
 /// Default standard deviation in pixels of the edges of boxes that the detector of COCO gives.
 const COCO_PIXEL_SIGMA_PX: f64 = 3.0;
 
-/// The machine's name without its domain, as far as names of nodes may have its characters.
+/// The machine's name without its domain, limited to characters that are allowed in names of nodes.
 fn host_name() -> Option<NodeName> {
     let system = rustix::system::uname();
     let host = system.nodename().to_str().ok()?.split('.').next()?;

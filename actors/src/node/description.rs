@@ -1,4 +1,4 @@
-//! The cell's description at a node: with which one it starts, and what follows from it.
+//! The cell's description on a node: the initial description, and the settings that follow from it.
 
 use std::sync::Arc;
 
@@ -21,10 +21,11 @@ pub(super) struct HeldDescription {
 }
 
 impl HeldDescription {
-    /// The one of an earlier run, or else of the file with which a node that may lead starts its cell.
+    /// The description of an earlier run or, otherwise, of the file with which a node that may lead
+    /// starts its cell.
     ///
     /// # Errors
-    /// When that file cannot be used.
+    /// Returns an error if that file cannot be used.
     pub(super) fn at_start(config: &NodeConfig) -> Result<Self, NodeError> {
         let saved = description_file(config).and_then(|file| {
             file.load(|saved: &CellDescription| {
@@ -72,8 +73,9 @@ impl HeldDescription {
         })
     }
 
-    /// The node's own configuration under the description. One that contradicts it, or that this version cannot read, is
-    /// not used, and the log and `problem` say why: a description of others stops no node, also when it starts.
+    /// Applies the description to the node's own configuration. A description that contradicts it,
+    /// or that this version cannot read, is not used, and the log and `problem` contain the reason:
+    /// a description from other nodes must not stop a node, even at its start.
     pub(super) fn lay_over(&mut self, own: &NodeConfig) -> Option<NodeConfig> {
         let description = self.description.as_ref()?;
         let (stamp, set_by) = (description.stamp(), &description.set_by);
@@ -110,7 +112,7 @@ impl HeldDescription {
 /// Longest reason in a status, in characters.
 const MAX_PROBLEM: usize = 500;
 
-/// Where a node keeps the cell's description, if it keeps anything.
+/// File in which a node stores the cell's description, if it keeps state.
 pub(crate) fn description_file(config: &NodeConfig) -> Option<StateFile> {
     let (directory, name) = (config.state_dir.as_deref()?, config.name.as_ref()?);
     Some(StateFile::new(directory, &config.cell, name, "description"))
@@ -121,7 +123,7 @@ pub(super) fn rates_by_evidence(config: &NodeConfig) -> bool {
     config.fusion.vote.mode != VoteMode::Paper || !config.fusion.algorithms.vote()
 }
 
-/// The shared settings that pages and readiness go by.
+/// The shared settings that pages and readiness use.
 pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> SharedFacts {
     SharedFacts {
         patience: patience(&config.fusion),

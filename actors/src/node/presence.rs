@@ -1,8 +1,10 @@
-//! Presence of a node in its cell, and the parts that go along when a vehicle moves to another cell.
+//! Presence of a node in its cell, and the parts that move along when a vehicle changes to another
+//! cell.
 //!
-//! A moving vehicle has two nodes for a moment: the present one, and one beside it that gets ready in the next cell. Cameras,
-//! poses, counters and addresses are the vehicle's, and both know them. Detectors run on; the next node's projectors take
-//! the place of the present ones. So a frame is reported in one cell only.
+//! A moving vehicle temporarily has two nodes: the present one, and a second one that prepares in
+//! the next cell. Cameras, poses, counters and addresses belong to the vehicle, and both nodes
+//! share them. Detectors keep running; the next node's projectors replace the projectors of the
+//! present node. A frame is therefore reported in one cell only.
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -30,18 +32,18 @@ use crate::observe::recorder::LogSender;
 use crate::telemetry::counters::Counters;
 use crate::telemetry::spans::Spans;
 
-/// How far a node has come into its cell.
+/// How far a node has entered its cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Presence {
-    /// It follows, while another node of the vehicle is present in another cell.
+    /// The node follows the leader, while another node of the vehicle is present in another cell.
     Beside,
     /// It reports, too.
     Reporting,
-    /// It has page, door and log, too.
+    /// The node also has page, local broker and log.
     Whole,
 }
 
-/// Parts and addresses that a vehicle has once, in whatever cell it is.
+/// Parts and addresses of which a vehicle has one, independent of its cell.
 #[derive(Clone)]
 pub(super) struct VehicleParts {
     /// The cell in which it is present.
@@ -50,22 +52,22 @@ pub(super) struct VehicleParts {
     /// The present node's log and spans.
     pub(super) log: watch::Sender<LogSender>,
     pub(super) spans: watch::Sender<Spans>,
-    /// Poses of the last moments, the newest last.
+    /// The vehicle's most recent poses, the newest last.
     pub(super) poses: watch::Sender<VecDeque<(Timestamp, StatedPose)>>,
     pub(super) pose_receiver: ActorSlot<PoseReceiverMessage>,
     #[cfg(feature = "camera")]
     pub(super) projectors: Vec<ActorSlot<ProjectorMessage>>,
     #[cfg(feature = "camera")]
     pub(super) detectors: Vec<ActorSlot<DetectorMessage>>,
-    /// The cameras, if browsers are to see their pictures.
+    /// The cameras, if the page shows their pictures.
     pub(super) shown_cameras: Vec<ShownCamera>,
-    /// Address of the broker, whoever may use it.
+    /// Address of the broker, for any use.
     pub(super) listens_at: watch::Sender<Option<SocketAddr>>,
     pub(super) dashboard_address: watch::Sender<Option<SocketAddr>>,
 }
 
 impl VehicleParts {
-    /// Those of a vehicle with this configuration.
+    /// The parts of a vehicle with this configuration.
     pub(super) fn new(config: &NodeConfig) -> Self {
         #[cfg(feature = "camera")]
         let (projectors, detectors) = config.all_cameras().map(|_| Default::default()).unzip();
@@ -104,7 +106,7 @@ impl VehicleParts {
         }
     }
 
-    /// Running parts that go along with the vehicle.
+    /// Running parts that move along with the vehicle.
     fn running(&self) -> Vec<(ActorKind, ActorCell)> {
         let poses = self
             .pose_receiver
@@ -127,21 +129,22 @@ impl VehicleParts {
     }
 }
 
-/// A step of a vehicle's way to another cell, for one of its two nodes.
+/// A step of a vehicle's change to another cell, for one of its two nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MoveStep {
-    /// Stop the door, so that another node of the vehicle has its address.
+    /// Stop the local broker, so that another node of the vehicle can use its address.
     CloseDoor,
-    /// Let the vehicle's running parts go. The projectors run until the next node's take their place.
+    /// Release the vehicle's running parts. The projectors run until the next node's projectors
+    /// replace them.
     HandOver,
-    /// Take the vehicle's running parts, and report from now on.
+    /// Take over the vehicle's running parts, and report from now on.
     TakeOver,
-    /// Have page, door and log again.
+    /// Start page, local broker and log again.
     Settle,
 }
 
 impl SupervisorState {
-    /// Takes a step of the vehicle's way to another cell.
+    /// Carries out a step of the vehicle's change to another cell.
     pub(super) async fn take_step(
         &mut self,
         step: MoveStep,
@@ -162,7 +165,7 @@ impl SupervisorState {
         started.inspect_err(|error| self.builder.give_up(NodeError::Failed(error.to_string())))
     }
 
-    /// Goes on to this presence: starts the parts that it adds.
+    /// Continues to this presence: starts the parts that it adds.
     async fn advance(
         &mut self,
         presence: Presence,
@@ -172,7 +175,7 @@ impl SupervisorState {
         self.start_missing(supervisor).await
     }
 
-    /// Starts the parts that the node has by now and that do not run.
+    /// Starts the parts that the node should have now and that are not running.
     pub(super) async fn start_missing(
         &mut self,
         supervisor: &ActorCell,
@@ -198,7 +201,7 @@ impl SupervisorState {
     async fn take_over(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
         for (kind, part) in self.builder.vehicle().running() {
             part.link(supervisor.clone());
-            // One that has just ended is started anew.
+            // A part that has just ended is restarted.
             if part.get_status() <= ActorStatus::Upgrading {
                 self.running.insert(part.get_id(), kind);
             }

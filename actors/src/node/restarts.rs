@@ -1,4 +1,4 @@
-//! How often parts may be started anew.
+//! Limit on restarts of a node's parts.
 
 use std::collections::VecDeque;
 use std::time::Duration;

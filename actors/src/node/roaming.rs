@@ -6,7 +6,8 @@
 //!                                    └─ next node: gets ready beside it, then takes them over
 //! ```
 //!
-//! The next node follows its cell's leader before the present one is left, so the vehicle has maps all the time.
+//! The next node follows its cell's leader before the vehicle leaves the present node, so the
+//! vehicle always has maps.
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -24,10 +25,10 @@ use super::service::ServiceManager;
 use super::{NodeError, NodeHandle, NodeMessage, start_with};
 use crate::platform::clock;
 
-/// Time between two looks at the position.
+/// Time between two checks of the position.
 const LOOK_PERIOD: Duration = Duration::from_millis(200);
 
-/// Age of a pose that is no longer gone by.
+/// Age from which a pose is too old to be used.
 const MAX_POSE_AGE: Duration = Duration::from_secs(2);
 
 const NO_PLACE: &str = "no pose on Earth is known: the vehicle stays in its cell, wherever it is";
@@ -46,21 +47,22 @@ pub struct Roamer {
     next: Option<(NodeName, NodeHandle)>,
     /// The node of the cell that is being left.
     former: Option<NodeHandle>,
-    /// When its place was last known.
+    /// Time at which the position was last available.
     placed_at: Timestamp,
 }
 
 impl Roamer {
-    /// Starts the vehicle in its own cell; `config` is taken as valid. Without `cells` it stays there.
+    /// Starts the vehicle in its own cell; `config` is taken as valid. Without `cells` it stays
+    /// there.
     ///
     /// # Errors
-    /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
+    /// Returns a [`NodeError`] if a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
         let mut cells = config
             .load_cells()
             .map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
         let vehicle = VehicleParts::new(&config);
-        // A mistake in a cell elsewhere keeps no vehicle from its own.
+        // An error in another cell's entry must not keep the vehicle out of its own cell.
         cells.retain(|cell| match config.credentials_in(cell) {
             Ok(_) => true,
             Err(error) => {
@@ -102,7 +104,8 @@ impl Roamer {
     /// Moves from cell to cell until a node gives up.
     ///
     /// # Errors
-    /// [`NodeError`] always says why; a vehicle never ends well by itself.
+    /// Always returns a [`NodeError`] with the reason, because a vehicle does not end successfully
+    /// by itself.
     pub async fn drive(&mut self) -> Result<Infallible, NodeError> {
         let mut looks = interval(LOOK_PERIOD);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -126,7 +129,7 @@ impl Roamer {
         }
     }
 
-    /// Goes by the latest position, if there is one.
+    /// Processes the latest position, if there is one.
     async fn look(&mut self) -> Result<(), NodeError> {
         let (now, troubles) = (clock::now(), self.vehicle.counters.troubles());
         let place = self.place();
@@ -144,7 +147,7 @@ impl Roamer {
         }
     }
 
-    /// Where the vehicle is, on Earth.
+    /// The vehicle's position on Earth.
     fn place(&self) -> Option<GeographicPosition> {
         let (at, pose) = self.vehicle.poses.borrow().back().copied()?;
         let StatedPose::OnEarth(pose) = pose else {
@@ -160,7 +163,7 @@ impl Roamer {
         })
     }
 
-    /// Starts a node beside the present one.
+    /// Starts a second node in the next cell.
     async fn join(&mut self, cell: NodeName) -> Result<(), NodeError> {
         let Some(entry) = self.cells.iter().find(|entry| entry.name == cell) else {
             return Ok(());
@@ -169,7 +172,7 @@ impl Roamer {
             return Ok(());
         };
         tracing::info!(from = %self.choice.present(), %cell, "getting ready in the next cell");
-        // Nodes of the cell, and no programs alone, will connect to it.
+        // Nodes of the cell will connect to it, not just local programs.
         if config.serves_nodes()
             && let Err(error) = step(&self.present, MoveStep::CloseDoor).await
         {
@@ -213,13 +216,13 @@ impl Roamer {
         Ok(())
     }
 
-    /// Stays in the present cell, as no node can be had in the next one.
+    /// Stays in the present cell, because a node in the next cell could not be started.
     async fn fail(&mut self, cell: &NodeName, error: &NodeError) -> Result<(), NodeError> {
         self.choice.fail(cell, clock::now());
         self.stay(cell, &error.to_string()).await
     }
 
-    /// Stays in the present cell, without the node that was getting ready in another.
+    /// Stays in the present cell, and stops the node that was preparing in another.
     async fn stay(&mut self, cell: &NodeName, why: &str) -> Result<(), NodeError> {
         tracing::warn!(%cell, why, present = %self.choice.present(), "the vehicle stays in its cell");
         if let Some((_, next)) = self.next.take() {
@@ -232,13 +235,13 @@ impl Roamer {
 
 /// News of the next node.
 enum Change {
-    /// It follows its cell's leader, and knows where on Earth the cell is.
+    /// The node follows its cell's leader, and has the place of the cell on Earth.
     Follows,
     /// It has given up.
     Failed(NodeError),
 }
 
-/// Waits for news of the next node; for ever if there is none.
+/// Waits for news of the next node; forever if there is none.
 async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Change) {
     let Some((cell, node)) = next else {
         return std::future::pending().await;
@@ -263,7 +266,7 @@ async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Ch
     (cell.clone(), change)
 }
 
-/// Has a node take a step.
+/// Makes a node take a step.
 async fn step(node: &NodeHandle, step: MoveStep) -> Result<(), NodeError> {
     let taken = node
         .supervisor

@@ -1,9 +1,12 @@
-//! What a node tells the service manager that started it, by the protocol of systemd's `sd_notify`.
+//! Reports of a node to the service manager that started it, by the protocol of systemd's
+//! `sd_notify`.
 //!
-//! `READY=1` once all parts run, `STATUS=` whenever the node's readiness changes, `STOPPING=1` at the end. The watchdog is
-//! fed only while rounds flow: a node that follows a live aggregator whose rounds arrive, or that leads with a working
-//! broker. A leader at whose broker nobody can log in feeds it, too: its way to the others is broken, and a start anew would
-//! mend nothing. One that does none of this for as long as the watchdog waits is started anew.
+//! `READY=1` is sent once all parts run, `STATUS=` whenever the node's readiness changes, and
+//! `STOPPING=1` at the end. The watchdog is fed only while rounds flow: by a node that follows a
+//! live aggregator whose rounds arrive, or that leads with a working broker. A leader whose
+//! followers cannot log in at its broker also feeds it: its connection to the other nodes is
+//! broken, and a restart would not repair it. A node in any other state for as long as the
+//! watchdog's timeout is restarted.
 
 use std::io;
 use std::time::Duration;
@@ -14,18 +17,19 @@ use sd_notify::NotifyState;
 /// The service manager of this process.
 #[derive(Debug)]
 pub struct ServiceManager {
-    /// Time for which it waits for a sign of life; none without a watchdog.
+    /// Timeout of the watchdog; `None` without a watchdog.
     watchdog: Option<Duration>,
     told: Option<String>,
     failing: bool,
 }
 
-/// Time between two looks at readiness; shorter where a watchdog waits for less than a few of them.
+/// Time between two checks of readiness; shorter if the watchdog's timeout is less than a few of
+/// these periods.
 const PERIOD: Duration = Duration::from_secs(1);
 const BEATS: u32 = 4;
 
 impl ServiceManager {
-    /// The manager that the environment names; none where nobody waits to be told.
+    /// The manager that the environment names; `None` if the service was not started by a manager.
     pub fn from_environment() -> Option<Self> {
         std::env::var_os("NOTIFY_SOCKET")?;
         Some(Self {
@@ -47,7 +51,7 @@ impl ServiceManager {
         self.tell(&[NotifyState::Ready]);
     }
 
-    /// Takes the node's readiness; feeds the watchdog unless a start anew may help.
+    /// Processes the node's readiness; feeds the watchdog unless a restart may help.
     pub fn beat(&mut self, readiness: Readiness) {
         if !readiness.needs_restart && self.watchdog.is_some() {
             self.tell(&[NotifyState::Watchdog]);
@@ -63,7 +67,7 @@ impl ServiceManager {
         self.tell(&[NotifyState::Stopping]);
     }
 
-    /// A manager that does not listen is told of once.
+    /// Sends news to the manager; if the manager does not listen, this is logged once.
     fn tell(&mut self, news: &[NotifyState<'_>]) {
         let told: io::Result<()> = sd_notify::notify(news);
         if let Err(error) = &told

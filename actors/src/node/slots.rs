@@ -1,4 +1,4 @@
-//! The parts of a node and where each is reached.
+//! The parts of a node and their addresses.
 
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
@@ -39,14 +39,15 @@ pub enum ActorKind {
     Fuser,
     /// The connection to the region.
     Uplink,
-    /// The node's part in the election.
+    /// The node's election.
     LeaderElection,
     /// The node's page.
     Dashboard,
-    /// The maker of the reports of a camera, by its place in [`NodeConfig::all_cameras`](super::config::NodeConfig::all_cameras).
+    /// The producer of a camera's reports, by its place in
+    /// [`NodeConfig::all_cameras`](super::config::NodeConfig::all_cameras).
     #[cfg(feature = "camera")]
     Projector(usize),
-    /// The finder of objects in a camera's frames.
+    /// The detector of objects in a camera's frames.
     #[cfg(feature = "camera")]
     Detector(usize),
     /// The receiver of a moving vehicle's poses.
@@ -54,7 +55,7 @@ pub enum ActorKind {
 }
 
 impl ActorKind {
-    /// True for parts that work in one of a vehicle's cells at a time.
+    /// True for parts that work in only one of a vehicle's cells at a time.
     pub(super) fn is_of_vehicle(self) -> bool {
         match self {
             Self::PoseReceiver => true,
@@ -65,7 +66,7 @@ impl ActorKind {
     }
 }
 
-/// Where the parts of a node are reached.
+/// Addresses of the parts of a node.
 #[derive(Debug, Clone, Default)]
 pub struct ActorSlots {
     /// The recorder's.

@@ -1,4 +1,4 @@
-//! HTTP for pages: who is answered, how often, and over how many connections.
+//! HTTP for pages: access control, rates of requests, and limits of connections.
 
 pub(crate) mod access;
 pub(crate) mod connection_limit;

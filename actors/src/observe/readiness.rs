@@ -28,7 +28,7 @@ use crate::telemetry::counters::Counters;
 use crate::transport::broker::BrokerHealth;
 use crate::transport::mqtt::{BrokerAddress, DataPlane, LinkState, Security};
 
-/// Facts on which a node's readiness is judged; reading never makes another part wait.
+/// Data from which a node's readiness is determined; reading it does not block other parts.
 #[derive(Debug, Clone)]
 pub struct Vitals {
     /// The newest of everything.
@@ -43,28 +43,29 @@ pub struct Vitals {
     pub shared: watch::Receiver<SharedFacts>,
     /// The node's certificates, which are valid at certain times only.
     pub security: Security,
-    /// Has the node's present troubles.
+    /// Contains the node's current troubles.
     pub counters: Arc<Counters>,
-    /// Tells how reports are.
+    /// Provides the state of reports.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Tells how links are.
+    /// Provides the state of links.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// Tells whether the node's own broker serves.
+    /// Reports whether the node's own broker serves.
     pub broker: ActorSlot<BrokerMessage>,
 }
 
-/// Settings that the nodes of a cell share, as far as pages and readiness go by them.
+/// Settings that the nodes of a cell share, as far as pages and readiness use them.
 #[derive(Debug, Clone, Default)]
 pub struct SharedFacts {
-    /// Maximum age of the newest round of a live aggregator; none where rounds come only with reports.
+    /// Maximum age of the newest round of a live aggregator; `None` if rounds arrive only with
+    /// reports.
     pub patience: Option<Duration>,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
     /// The algorithms that the cell runs.
     pub algorithms: Algorithms,
-    /// Known locations.
+    /// The cell's landmarks.
     pub landmarks: Arc<[LandmarkConfig]>,
-    /// True if the place of the cell's frame on Earth is known.
+    /// True if the cell's frame has a place on Earth.
     pub has_origin: bool,
     /// True if the node does not use the cell's description.
     pub contradicts: bool,
@@ -75,7 +76,7 @@ pub struct SharedFacts {
 /// Answers of the gateway and the broker.
 #[derive(Debug, Clone, Default)]
 pub struct Probe {
-    /// States of the links; none when the gateway did not answer.
+    /// States of the links; `None` if the gateway did not answer.
     pub links: Option<BTreeMap<BrokerAddress, LinkState>>,
     /// True if the node's own broker serves.
     pub broker_serves: bool,
@@ -83,7 +84,7 @@ pub struct Probe {
     pub timeliness: Timeliness,
 }
 
-/// Possible cause of the node's separation from its cell, in words.
+/// Possible cause of the node's separation from its cell, as text.
 fn separating(troubles: &[Trouble]) -> Option<&str> {
     let kind = |trouble: &&Trouble| {
         TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating)
@@ -94,7 +95,7 @@ fn separating(troubles: &[Trouble]) -> Option<&str> {
         .map(|trouble| trouble.cause.as_str())
 }
 
-/// The node's own trouble for which it does not do its work, in words.
+/// The node's own trouble that prevents it from working, as text.
 fn disabling(troubles: &[Trouble]) -> Option<String> {
     let kind = |trouble: &&Trouble| {
         TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling)
@@ -106,15 +107,15 @@ fn disabling(troubles: &[Trouble]) -> Option<String> {
         .map(|trouble| trouble.cause.clone())
 }
 
-/// Maximum age of the newest round of a live aggregator; none for VOTE's `paper` mode alone, which has a round whenever
-/// the vehicles have sent a packet of frames.
+/// Maximum age of the newest round of a live aggregator; `None` for VOTE's `paper` mode alone,
+/// which closes a round whenever the vehicles have sent a packet of frames.
 pub fn patience(fusion: &FusionConfig) -> Option<Duration> {
     let by_packets = !fusion.algorithms.pace() && fusion.vote.mode == VoteMode::Paper;
     (!by_packets).then(|| round_timeout(Duration::from_secs_f64(fusion.round.period_s)))
 }
 
 impl Vitals {
-    /// Asks the parts how they are.
+    /// Queries the state of the parts.
     pub async fn probe(&self) -> Probe {
         let (health, links, timeliness) = tokio::join!(
             self.broker
@@ -132,7 +133,7 @@ impl Vitals {
         }
     }
 
-    /// Readiness of the node now, the parts being as they answered.
+    /// Current readiness of the node, given the answers of its parts.
     pub fn readiness(&self, probe: &Probe) -> Readiness {
         let leadership = self.leadership.borrow().clone();
         if let Some(fault) = self.security.clock_fault() {
@@ -146,7 +147,7 @@ impl Vitals {
         if leadership.is_leading() && !probe.timeliness.is_usable() {
             return Readiness::not(trouble);
         }
-        // The reports of its only vehicle depose no leader.
+        // The reports of a cell's only vehicle do not depose its leader.
         let lone = Some(trouble).filter(|_| leadership.is_leading() && timely == 0 && untimely > 0);
         let SharedFacts {
             patience, problem, ..
@@ -164,7 +165,7 @@ impl Vitals {
         .unless(problem.or(lone).or_else(|| disabling(&troubles)))
     }
 
-    /// True if a broker carries what this node publishes.
+    /// True if a broker carries the messages that this node publishes.
     fn broker_works(&self, probe: &Probe) -> bool {
         let up = |broker| {
             probe.links.as_ref().and_then(|links| links.get(broker)) == Some(&LinkState::Up)
@@ -172,7 +173,7 @@ impl Vitals {
         self.plane.external.as_ref().is_some_and(up) || (self.plane.embedded && probe.broker_serves)
     }
 
-    /// The newest round accepted: its epoch and when it came.
+    /// The newest accepted round: its epoch and time of receipt.
     fn last_round(&self) -> Option<(Epoch, Timestamp)> {
         newest_round(
             self.newest.map.borrow().as_ref(),
@@ -181,7 +182,7 @@ impl Vitals {
     }
 }
 
-/// The epoch of the newest round, be it a map or verdicts, and when it came.
+/// The epoch and time of receipt of the newest round, which may be a map or verdicts.
 pub fn newest_round(
     map: Option<&ReceivedMap>,
     verdicts: Option<&Received<Verdicts>>,

@@ -1,7 +1,8 @@
-//! Report about a log as one HTML page, in the cell's time: map and timeline, leadership, latency and gaps of rounds,
-//! reputations, coverage, losses.
+//! Report about a log as one HTML page, in the cell's time: map and timeline, leadership, latency
+//! and gaps of rounds, reputations, coverage, losses.
 //!
-//! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A [`Section`] adds to the page.
+//! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A
+//! [`Section`] adds to the page.
 
 mod losses;
 mod page;
@@ -41,7 +42,8 @@ pub trait Section: Debug {
     /// Takes a map or verdicts.
     fn round(&mut self, round: &FusedLine);
 
-    /// The section as HTML, made with [`section`], [`table`], [`drawing`] and [`bars`] like the others.
+    /// The section as HTML, made with [`section`], [`table`], [`drawing`] and [`bars`] like the
+    /// others.
     fn html(&self) -> String;
 }
 
@@ -112,10 +114,10 @@ impl Report {
         }
     }
 
-    /// Takes a file. The page lists what is unusable.
+    /// Reads a file. The page lists its unusable parts.
     ///
     /// # Errors
-    /// [`LogError::Unreadable`].
+    /// Returns [`LogError::Unreadable`] if the file cannot be read.
     pub fn file(&mut self, path: &Path) -> Result<(), LogError> {
         self.offset_us = cell_offset_us(path)?;
         let mut log = LogReader::open(path)?;
@@ -306,7 +308,8 @@ impl Report {
 const MAX_PROBLEMS: usize = 20;
 
 impl RoundTimes {
-    /// Adds a round; `offset_us` is from the recording node's clock to the cell's time, in which `at` is.
+    /// Adds a round; `offset_us` is from the recording node's clock to the cell's time, in which
+    /// `at` is.
     fn add(
         &mut self,
         at: Timestamp,

@@ -1,4 +1,5 @@
-//! Reading files that somebody named: regular ones, up to a size. A pipe or a device would be read without end.
+//! Reading files given by users: only regular files, up to a size. Reading a pipe or a device might
+//! not end.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
@@ -7,16 +8,19 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// Maximum size of a text file in bytes: configurations, keys, certificates, labels, recorded detections.
+/// Maximum size of a text file in bytes: configurations, keys, certificates, labels, recorded
+/// detections.
 const MAX_TEXT_BYTES: u64 = 256 * 1024 * 1024;
 
 /// Some editors begin a text with it.
 const BYTE_ORDER_MARK: char = '\u{feff}';
 
-/// Opens a regular file to read. Opening never waits, as it would for a pipe without a writer.
+/// Opens a regular file for reading. Opening does not block, as it would for a pipe without a
+/// writer.
 ///
 /// # Errors
-/// Those of the operating system; [`io::ErrorKind::InvalidInput`] for what is no regular file.
+/// Returns the operating system's error, or [`io::ErrorKind::InvalidInput`] if the file is not
+/// regular.
 pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new()
         .read(true)
@@ -39,7 +43,7 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// Reads a regular file of at most `max_bytes`.
 ///
 /// # Errors
-/// Those of [`open`]; [`io::ErrorKind::FileTooLarge`].
+/// Returns the errors of [`open`], or [`io::ErrorKind::FileTooLarge`].
 pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(max_bytes + 1).read_to_end(&mut bytes)?;
@@ -52,10 +56,10 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads a regular file as text in UTF-8, without a byte order mark.
+/// Reads a regular file as UTF-8 text, without a byte order mark.
 ///
 /// # Errors
-/// Those of [`read`]; [`io::ErrorKind::InvalidData`] for what is no UTF-8.
+/// Returns the errors of [`read`], or [`io::ErrorKind::InvalidData`] if the content is not UTF-8.
 pub fn read_text(path: &Path) -> io::Result<String> {
     let bytes = read(path, MAX_TEXT_BYTES)?;
     let text = String::from_utf8(bytes).map_err(|error| {

@@ -1,11 +1,11 @@
-//! The cell's time beside the node's steady clock, for all parts that date messages.
+//! The cell's time relative to the node's steady clock, for all parts that date messages.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ecod::leadership::cell_time::{ClockReading, EARLIEST};
 use ecod::model::time::Timestamp;
 
-/// The node's present reading of the cell's time. All clones show the same.
+/// The node's current reading of the cell's time, shared by all clones.
 #[derive(Debug, Clone, Default)]
 pub struct CellClock(Arc<Mutex<ClockReading>>);
 
@@ -15,7 +15,7 @@ impl CellClock {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Shows a reading. One that differs by less than a millisecond is noise, which nobody need follow.
+    /// Sets the reading. A change of less than a millisecond is noise and is ignored.
     pub fn show(&self, reading: ClockReading) {
         let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let moved_us = reading
@@ -43,7 +43,8 @@ impl CellClock {
         date.shifted(self.reading().offset_us.saturating_neg())
     }
 
-    /// A time of the steady clock in the cell's time, if that comes from a clock that was set.
+    /// A time of the steady clock in the cell's time; `None` if that time comes from a clock that
+    /// was not set.
     pub fn date_if_set(&self, at: Timestamp) -> Option<Timestamp> {
         Some(self.date(at)).filter(|date| *date >= EARLIEST)
     }

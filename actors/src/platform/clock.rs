@@ -1,4 +1,5 @@
-//! The node's clocks: a steady one for everything that happens inside the node, and the machine's wall clock.
+//! The node's clocks: a steady one for everything that happens inside the node, and the machine's
+//! wall clock.
 
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -6,28 +7,29 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use ecod::model::time::Timestamp;
 use rustix::time::{ClockId, Timespec, clock_gettime};
 
-/// The present time of the steady clock in microseconds. It never steps.
+/// The current time of the steady clock in microseconds. This clock does not step.
 ///
-/// It starts as the wall clock of the first call. From then on time passes by the monotonic clock that includes suspension.
-/// All durations, timers and times of arrival are by this clock. Messages that leave the node are dated by
-/// [`CellClock`](super::cell_clock::CellClock).
+/// It starts at the wall clock's value in the first call. From then on it follows the monotonic
+/// clock that includes suspension. All durations, timers and times of arrival use this clock.
+/// Messages that leave the node are dated by [`CellClock`](super::cell_clock::CellClock).
 pub fn now() -> Timestamp {
     at(since_boot())
 }
 
-/// The steady clock's time in microseconds when the machine had run for `since_boot`. All processes share that time.
+/// The steady clock's time in microseconds when the machine had run for `since_boot`. All processes
+/// share that time.
 pub fn at(since_boot: Duration) -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
     let (started, wall) = ANCHOR.get_or_init(|| (self::since_boot(), wall()));
     *wall + since_boot.saturating_sub(*started)
 }
 
-/// The wall clock less the steady clock in microseconds. It changes when the wall clock steps.
+/// The wall clock minus the steady clock in microseconds. It changes when the wall clock steps.
 pub fn wall_offset_us() -> i64 {
     wall().micros_from(now())
 }
 
-/// The wall clock in Unix microseconds, as right or wrong as the machine has it.
+/// The machine's wall clock in Unix microseconds, which may be wrong.
 pub fn wall() -> Timestamp {
     Timestamp::default()
         + SystemTime::now()

@@ -15,7 +15,7 @@ pub fn content_hash(set_by: &NodeName, text: &str) -> ContentHash {
     hash
 }
 
-/// True if a description's hash is that of its content.
+/// True if a description's hash matches its content.
 pub fn is_intact(description: &CellDescription) -> bool {
     description.hash == content_hash(&description.set_by, &description.text)
 }

@@ -1,4 +1,4 @@
-//! A channel of one value: a new one replaces one that was not taken.
+//! A channel of one value: a new value replaces a value that was not taken.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -32,7 +32,7 @@ impl<T> Default for LatestSlot<T> {
 }
 
 impl<T> LatestSlot<T> {
-    /// Stores a value. One that was not taken is dropped and counted as skipped.
+    /// Stores a value. A previous value that was not taken is dropped and counted as skipped.
     pub fn put(&self, value: T) {
         let mut state = self.lock();
         state.skipped += u64::from(state.value.replace(value).is_some());
@@ -46,7 +46,8 @@ impl<T> LatestSlot<T> {
         self.changed.notify_one();
     }
 
-    /// Waits for the latest value and takes it; `None` once closed and empty. Cancelling the wait loses nothing.
+    /// Waits for the latest value and takes it; `None` once the channel is closed and empty.
+    /// Cancelling the wait does not lose a value.
     pub async fn take(&self) -> Option<T> {
         loop {
             if let Some(value) = self.try_take() {

@@ -1,12 +1,14 @@
-//! State files that survive crashes: they hold the last complete state or the one before, never a mixture.
+//! State files that survive crashes: they contain the last complete state or its predecessor, but
+//! not a mixture.
 //!
 //! ```text
 //! ecod-state 1 <SHA-256 of the rest, 64 hexadecimal digits>
 //! <the state as JSON>
 //! ```
 //!
-//! A file that was damaged, or edited by hand, does not have its checksum. It is set aside, and the node starts without
-//! it. Files of early versions are JSON alone; they are read as they are, and get a checksum when they are next written.
+//! A file that was damaged, or edited by hand, does not have its checksum. It is set aside, and the
+//! node starts without it. Files of early versions are JSON alone; they are read as they are, and
+//! get a checksum when they are next written.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -33,7 +35,8 @@ const MAX_BYTES: u64 = 64 * 1024 * 1024;
 const HEADER: &str = "ecod-state 1 ";
 
 impl StateFile {
-    /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can share a directory.
+    /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can
+    /// share a directory.
     pub fn new(directory: &Path, cell: &NodeName, node: &NodeName, what: &str) -> Self {
         Self {
             path: directory.join(format!("{cell}.{node}.{what}.json")),
@@ -43,7 +46,7 @@ impl StateFile {
     /// Lock on the state of a node, which its process holds as long as it runs.
     ///
     /// # Errors
-    /// When another process holds it, or the directory cannot be written.
+    /// Returns an error if another process holds it, or the directory cannot be written.
     pub fn lock(directory: &Path, cell: &NodeName, node: &NodeName) -> io::Result<File> {
         fs::create_dir_all(directory)?;
         let file = OpenOptions::new()
@@ -55,12 +58,13 @@ impl StateFile {
         Ok(file)
     }
 
-    /// The file.
+    /// Path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The state written last, if it is undamaged and `is_ours`. Any other content is set aside with a warning.
+    /// The last written state, if it is undamaged and `is_ours` accepts it. Any other content is
+    /// set aside with a warning.
     pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
         let bytes = match bounded_file::read(&self.path, MAX_BYTES) {
             Ok(bytes) => bytes,
@@ -79,15 +83,15 @@ impl StateFile {
         None
     }
 
-    /// The state that another process keeps here. The file stays as it is.
+    /// The state that another process keeps in this file. The file is not changed.
     ///
     /// # Errors
-    /// When there is none, or it is damaged.
+    /// Returns an error if the file is missing or damaged.
     pub fn peek<T: DeserializeOwned>(&self) -> io::Result<T> {
         parse(&bounded_file::read(&self.path, MAX_BYTES)?).map_err(io::Error::other)
     }
 
-    /// Renames the file to `….set-aside`, with a warning that says why.
+    /// Renames the file to `….set-aside`, with a warning that contains the reason.
     pub fn set_aside(&self, why: &str) {
         let aside = self.path.with_extension("set-aside");
         let moved = fs::rename(&self.path, &aside).err();
@@ -101,7 +105,7 @@ impl StateFile {
     /// Deletes the file; true if there was one.
     ///
     /// # Errors
-    /// When the directory refuses it.
+    /// Returns an error if the directory refuses it.
     pub fn delete(&self) -> io::Result<bool> {
         match fs::remove_file(&self.path) {
             Ok(()) => Ok(true),
@@ -113,7 +117,7 @@ impl StateFile {
     /// Replaces the state. After `Ok` it survives a loss of power.
     ///
     /// # Errors
-    /// When the directory or disk refuses it; the state before is then still there.
+    /// Returns an error if the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
         replace_file(
@@ -134,10 +138,10 @@ pub(crate) fn with_checksum(state: &[u8]) -> Vec<u8> {
     [HEADER.as_bytes(), checksum(state).as_bytes(), b"\n", state].concat()
 }
 
-/// The bytes of the state in a file whose checksum is right. Without a header, all of it.
+/// The bytes of the state in a file with a correct checksum; without a header, the whole file.
 ///
 /// # Errors
-/// The flaw, if the checksum is wrong.
+/// Returns the flaw if the checksum is wrong.
 pub(crate) fn content(bytes: &[u8]) -> Result<&[u8], String> {
     let Some(rest) = bytes.strip_prefix(HEADER.as_bytes()) else {
         return Ok(bytes);
@@ -153,13 +157,14 @@ fn checksum(state: &[u8]) -> String {
     hex::encode(digest(&SHA256, state))
 }
 
-/// Replaces a file atomically, with permissions `mode` less the process's umask. After `Ok` it survives a loss of power.
+/// Replaces a file atomically, with permissions `mode` minus the process's umask. After `Ok` it
+/// survives a loss of power.
 ///
 /// # Errors
-/// When the directory or disk refuses it; the file before is then still there.
+/// Returns an error if the directory or disk refuses it; the file before is then still there.
 pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = path.with_extension("tmp");
-    // One that was left over keeps its own permissions.
+    // A temporary file that was left over would keep its own permissions.
     match fs::remove_file(&temporary) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}

@@ -1,4 +1,4 @@
-//! A state file that is written beside its owner's work.
+//! A state file that is written concurrently with its owner's work.
 
 use std::io;
 use std::time::Duration;
@@ -9,7 +9,8 @@ use tokio::task::JoinHandle;
 
 use super::state_file::StateFile;
 
-/// Writer of one state file, one write at a time. A disk that hangs holds up one save for [`DISK_TIMEOUT`], and no other.
+/// Writer of one state file, one write at a time. A disk that hangs delays one save by
+/// [`DISK_TIMEOUT`], but not the following ones.
 #[derive(Debug)]
 pub struct StateWriter {
     file: Option<StateFile>,
@@ -23,7 +24,7 @@ pub struct StateWriter {
 /// Result of a save.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SaveOutcome {
-    /// Nothing had changed, or there is no file.
+    /// The state had not changed, or there is no file.
     Unchanged,
     /// The state is on the disk.
     Written,
@@ -43,7 +44,7 @@ impl StateWriter {
         }
     }
 
-    /// Has the next save write.
+    /// Makes the next save write the file.
     pub fn note_change(&mut self) {
         self.is_unsaved = true;
     }
@@ -56,7 +57,7 @@ impl StateWriter {
         let Some(file) = &self.file else {
             return SaveOutcome::Unchanged;
         };
-        // A write that is still under way was waited for before.
+        // A write that is still in progress was already waited for in an earlier call.
         let patience = if self.writing.is_some() {
             Duration::ZERO
         } else {
@@ -79,7 +80,7 @@ impl StateWriter {
             }
             Err(elapsed) => Err(elapsed.into()),
         };
-        // After a late answer too: the state may have changed since.
+        // Also after a late answer: the state may have changed in the meantime.
         self.is_unsaved |= written.is_err();
         let had_failed = std::mem::replace(&mut self.has_failed, written.is_err());
         let Err(error) = written else {

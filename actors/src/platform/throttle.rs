@@ -30,12 +30,12 @@ impl TokenBucket {
         now.since(self.refilled_at) >= self.interval * self.burst.saturating_sub(self.tokens)
     }
 
-    /// Takes a token; false when there is none.
+    /// Takes a token; returns false if there are no tokens left.
     pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
         self.allow_many(1, now)
     }
 
-    /// Takes so many tokens at once; false, and none taken, when there are fewer.
+    /// Takes `count` tokens at once; returns false, without taking any, if there are fewer.
     pub(crate) fn allow_many(&mut self, count: u32, now: Timestamp) -> bool {
         let earned = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
         let earned = u32::try_from(earned).unwrap_or(u32::MAX);
@@ -62,7 +62,8 @@ pub struct KeyedThrottle<K> {
     sources: BTreeMap<K, TokenBucket>,
 }
 
-/// Default maximum of sources with a bucket. While as many are busy, further sources are allowed nothing.
+/// Default maximum of sources with a bucket. While all buckets are busy, further sources are
+/// denied.
 const MAX_SOURCES: usize = 8192;
 
 impl<K: Ord + Clone> KeyedThrottle<K> {
@@ -75,12 +76,12 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
         }
     }
 
-    /// As many messages per second as in a burst.
+    /// A throttle whose burst equals its rate per second.
     pub fn per_second(count: u32) -> Self {
         Self::new(count.max(1), Duration::from_secs(1) / count.max(1))
     }
 
-    /// The same with buckets for so many sources.
+    /// The same throttle with buckets for at most `max_sources` sources.
     #[must_use]
     pub fn with_max_sources(self, max_sources: usize) -> Self {
         Self {
@@ -89,12 +90,13 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
         }
     }
 
-    /// Takes a token of a source; false when there is none.
+    /// Takes a token of a source; returns false if there are no tokens left.
     pub fn allow(&mut self, source: &K, now: Timestamp) -> bool {
         self.allow_many(source, 1, now)
     }
 
-    /// Takes so many tokens of a source at once; false, and none taken, when there are fewer.
+    /// Takes `count` tokens of a source at once; returns false, without taking any, if there are
+    /// fewer.
     pub(crate) fn allow_many(&mut self, source: &K, count: u32, now: Timestamp) -> bool {
         if let Some(throttle) = self.sources.get_mut(source) {
             return throttle.allow_many(count, now);
@@ -112,8 +114,8 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
     }
 }
 
-/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴ addresses to choose
-/// from.
+/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴
+/// addresses to choose from.
 pub(crate) fn host_network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V4(v4) => IpAddr::V4(v4),

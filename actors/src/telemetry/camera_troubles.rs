@@ -20,7 +20,7 @@ impl CameraTroubles {
         Self { counters, part }
     }
 
-    /// Notes a trouble.
+    /// Records a trouble.
     pub fn note(&self, kind: TroubleKind, cause: &str) {
         match &self.part {
             Some(part) => self
@@ -31,7 +31,7 @@ impl CameraTroubles {
         }
     }
 
-    /// Notes that a trouble is over.
+    /// Records that a trouble is over.
     pub fn settle(&self, kind: TroubleKind) {
         self.counters
             .troubles()

@@ -25,7 +25,7 @@ pub enum Event {
     PublishRefused,
     /// A payload was not sent because it is larger than receivers accept.
     PublishTooLarge,
-    /// A packet came in from a broker.
+    /// A packet arrived from a broker.
     Received,
     /// The broker sent back what this node had published; it was delivered in-process already.
     Echo,
@@ -43,17 +43,20 @@ pub enum Event {
     BrokerRefused,
     /// A map newer than all before was accepted.
     MapAccepted,
-    /// A map, verdicts or reputations came again, as each does that arrives over two links.
+    /// A map, verdicts or reputations arrived again, as every message that arrives over two links
+    /// does.
     Repeated,
     /// An object of a report had no effect on any vote, such as at an unknown landmark.
     VoteIgnored,
-    /// A report was used for tracking only, as a later one of its vehicle had come before it.
+    /// A report was used for tracking only, because a later report of its vehicle had arrived
+    /// first.
     ReportOvertaken,
-    /// A report came too late for tracking.
+    /// A report arrived too late for tracking.
     ReportLate,
     /// A new object was not tracked: there are too many tracks, or too many near it.
     ObjectRefused,
-    /// An entry of a map, of verdicts or of reputations was left out, because a value in it is out of bounds.
+    /// An entry of a map, of verdicts or of reputations was left out, because a value in it is out
+    /// of bounds.
     EntryLeftOut,
     /// Verdicts newer than all before were accepted.
     VerdictsAccepted,
@@ -85,7 +88,7 @@ pub enum Event {
     SourceFailed,
     /// A browser's request was refused for its token, its host name, or lack of room.
     BrowserRefused,
-    /// A browser's request was refused because too many were made lately.
+    /// A browser's request was refused because there were too many recently.
     BrowserThrottled,
     /// The dashboard's address could not be listened on.
     DashboardNotBound,
@@ -93,9 +96,10 @@ pub enum Event {
     DetectionUnplaced,
     /// A pose for a moving vehicle was malformed, or not later than the one before.
     PoseRejected,
-    /// A frame of a moving vehicle was not reported: no pose is known near its time.
+    /// A frame of a moving vehicle was not reported: there is no pose near its time.
     FrameWithoutPose,
-    /// The embedded broker refused a client: its address connects too often, or too many connections wait.
+    /// The embedded broker refused a client: its address connects too often, or too many
+    /// connections wait.
     ClientThrottled,
     /// A client of the embedded broker did not log in in time.
     ClientTimedOut,
@@ -103,31 +107,37 @@ pub enum Event {
     ClientUntrusted,
     /// A client of the embedded broker did not begin with a login, or left during it.
     ClientMalformed,
-    /// The embedded broker refused a client: as many as allowed are connected, in all or of its certificate or address.
+    /// The embedded broker refused a client: as many as allowed are connected, in all or of its
+    /// certificate or address.
     ClientsFull,
-    /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a limit.
+    /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a
+    /// limit.
     ClientDenied,
     /// Another node declared more in the election than its certificate allows.
     Overreached,
-    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there was no room.
+    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there
+    /// was no room.
     ClientStalled,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
     /// A map of the cell was handed to the connection to the region's broker.
     RegionPublished,
-    /// A map of the cell was not sent to the region: its broker is not connected or passes nothing on.
+    /// A map of the cell was not sent to the region: its broker is not connected or does not
+    /// forward messages.
     RegionWithheld,
-    /// A packet came in from the region's broker.
+    /// A packet arrived from the region's broker.
     RegionReceived,
     /// A map of a neighbouring cell, newer than all of that cell before, was accepted.
     CellMapAccepted,
-    /// An object of a neighbouring cell was not used: outside of what that cell may tell of, or beyond the maximum number.
+    /// An object of a neighbouring cell was not used: outside of the area that its cell may report,
+    /// or beyond the maximum number.
     NeighbourRefused,
     /// The cell's counts about a vehicle were handed to the connection to the region's broker.
     CellReputationPublished,
-    /// Counts of another cell about a vehicle that is present were taken and held something new.
+    /// Counts of another cell about a present vehicle were accepted and contained news.
     CellReputationAccepted,
-    /// The region is not told of a vehicle that has left: too many wait for its broker.
+    /// Counts about a vehicle that has left were not sent to the region: too many are waiting for
+    /// its broker.
     CellReputationDropped,
 }
 
@@ -174,15 +184,15 @@ impl Counters {
         self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
-    /// Counts a rejected payload, other than a report, of a node, or of a broker where the sender is not known. It is a
-    /// trouble, unless elections and re-ordering explain it.
+    /// Counts a rejected payload other than a report, by its node, or by the broker if the sender
+    /// is unavailable. It is a trouble, unless elections or re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
         self.reject_message(reason, source, || {
             format!("message rejected: {}", reason.in_words())
         });
     }
 
-    /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
+    /// Counts a rejected payload as [`Self::reject`] does, with the cause as text.
     pub fn reject_message(
         &self,
         reason: RejectReason,
@@ -196,7 +206,7 @@ impl Counters {
         }
     }
 
-    /// Counts a rejected report, with the cause in words.
+    /// Counts a rejected report, with the cause as text.
     pub fn reject_report(
         &self,
         reason: RejectReason,
@@ -230,7 +240,7 @@ impl Counters {
         self.shed.count(reason, source);
         let cause = match reason {
             ShedReason::ReaderSlow => "reads too slowly and misses the oldest messages",
-            // A busy fuser takes the later report: the vehicle need not know.
+            // A busy fuser uses the later report: the vehicle need not be informed.
             ShedReason::ReportReplaced => return,
             _ => "sends more than is taken, the rest is not used",
         };
@@ -278,8 +288,8 @@ impl Counters {
     }
 }
 
-/// The trouble that a reason is a sign of where a report is rejected. Some occur without anybody's fault: around a change of leader, or on a network
-/// that re-orders.
+/// The trouble indicated by a reason for which a report is rejected. Some reasons also occur
+/// without a fault: around a change of leader, or on a network that re-orders.
 fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
     use RejectReason as Reason;
     match reason {

@@ -1,4 +1,5 @@
-//! Throttle of log lines: a bounded number from each place in the code, whatever peers send.
+//! Throttle of log lines: a bounded number from each place in the code, independent of the peers'
+//! messages.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,11 +14,12 @@ use tracing_subscriber::layer::{Context, Filter};
 use crate::platform::clock;
 use crate::platform::throttle::TokenBucket;
 
-/// Lines that one place in this project may write at once, and the time after which it may write one more.
+/// Lines that one place in this project may write at once, and the time after which it may write
+/// one more.
 const OWN_BURST: u32 = 200;
 const OWN_INTERVAL: Duration = Duration::from_millis(100);
 
-/// The same for one place in a library: libraries log single packets of peers.
+/// Burst and interval for one place in a library: libraries log single packets of peers.
 const LIBRARY_BURST: u32 = 10;
 const LIBRARY_INTERVAL: Duration = Duration::from_secs(10);
 
@@ -32,14 +34,15 @@ pub(crate) fn lines_left_out() -> u64 {
     LEFT_OUT.load(Ordering::Relaxed)
 }
 
-/// Filter of events that lets each place in the code write a burst of lines, then one per interval. Lines below the level
-/// `info` pass: somebody has asked for all of them.
+/// Filter of events that allows each place in the code a burst of lines, then one per interval.
+/// Lines below the level `info` pass, because they were requested explicitly.
 #[derive(Debug, Default)]
 pub(crate) struct LineThrottle {
     places: Mutex<HashMap<CodePlace, TokenBucket>>,
 }
 
-/// A place in the code: target and line. The code of a program is finite, and so is the number of places.
+/// A place in the code: target and line. The code of a program is finite, and so is the number of
+/// places.
 type CodePlace = (String, u64);
 
 impl LineThrottle {

@@ -1,8 +1,8 @@
 //! Export of spans to a collector, by OTLP over HTTP.
 //!
-//! The ids of a span that has a name follow from the name: trace id = UUIDv5 of `ecod:<name>` in the namespace of URLs,
-//! span id = its last eight bytes. Whoever can name a span can link to it, and traces that are sampled by their id are
-//! sampled alike on all nodes.
+//! The ids of a named span are derived from its name: trace id = UUIDv5 of `ecod:<name>` in the
+//! namespace of URLs, span id = its last eight bytes. A node that can derive the name can link to
+//! the span, and traces that are sampled by their id are sampled consistently on all nodes.
 
 use std::cell::Cell;
 use std::time::{Duration, SystemTime};
@@ -23,19 +23,19 @@ use uuid::Uuid;
 
 use crate::platform::clock;
 
-/// Sends what is left when it is dropped.
+/// Sends the remaining spans when it is dropped.
 #[derive(Debug)]
 pub struct Export(SdkTracerProvider);
 
-/// Time that the last spans have on their way, in case the collector hangs.
+/// Time for sending the last spans, in case the collector hangs.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl Export {
-    /// Exports this program's spans, and its events within them, as the standard environment variables say:
-    /// `OTEL_EXPORTER_OTLP_…`, `OTEL_TRACES_SAMPLER`, `OTEL_SERVICE_NAME`.
+    /// Exports this program's spans, and the events within them, as configured by the standard
+    /// environment variables: `OTEL_EXPORTER_OTLP_…`, `OTEL_TRACES_SAMPLER`, `OTEL_SERVICE_NAME`.
     ///
     /// # Errors
-    /// When a variable cannot be used.
+    /// Returns an error if a variable cannot be used.
     pub fn start() -> anyhow::Result<(Self, impl Layer<Registry> + Send + Sync)> {
         let mut resource = Resource::builder();
         if std::env::var_os("OTEL_SERVICE_NAME").is_none() {
@@ -65,7 +65,7 @@ impl Drop for Export {
     }
 }
 
-/// Gives spans what their fields `ecod.*` say: ids, parent, links and start.
+/// Applies the fields `ecod.*` of spans: ids, parent, links and start.
 #[derive(Debug)]
 struct NamingTracer(SdkTracer);
 
@@ -118,7 +118,7 @@ thread_local! {
     static NAMED: Cell<Option<Uuid>> = const { Cell::new(None) };
 }
 
-/// Ids of named spans, and random ones of the others.
+/// Ids of named spans, and random ids of other spans.
 #[derive(Debug, Default)]
 struct NamedIds(RandomIdGenerator);
 
@@ -155,7 +155,8 @@ fn span_id(id: Uuid) -> SpanId {
     id.as_u64_pair().1.into()
 }
 
-/// A time of the node by the system's clock, which says when spans end and may have been set since the node started.
+/// A time of the node by the system's clock, which dates the end of spans and may have been set
+/// since the node started.
 fn on_this_clock(at: Timestamp) -> Option<SystemTime> {
     SystemTime::now().checked_sub(clock::now().since(at))
 }

@@ -1,4 +1,4 @@
-//! Spans of a detection's way from a frame to the maps that vehicles accept.
+//! Spans along a detection's path from a frame to the maps that vehicles accept.
 //!
 //! ```text
 //! vehicle     frame ─┬─ detect      from capture to published report
@@ -10,11 +10,12 @@
 //! every node         └─ accept      from receipt of a map or verdicts to its acceptance
 //! ```
 //!
-//! `ractor` hands the span of a sender on with each message, so that an actor's spans become children of what caused
-//! them. A span ends when the last message that it caused has been dealt with.
+//! `ractor` passes the sender's span with each message, so that an actor's spans become children of
+//! the span that caused them. A span ends when the last message that it caused has been handled.
 //!
-//! Between nodes nothing travels beside the payloads: both sides name a frame or a round by what its report or map says
-//! of it. The fields `ecod.*` carry these names to whoever records spans; see `telemetry::otlp`.
+//! Nodes exchange only payloads, without trace contexts: both sides derive the name of a frame or
+//! round from the fields of its report or map. The fields `ecod.*` pass these names to the recorder
+//! of spans; see `telemetry::otlp`.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -35,11 +36,11 @@ pub struct Spans {
     clock: CellClock,
 }
 
-/// Reports that a round has taken so far: node and capture, and when they came.
+/// Reports that a round has used so far: node, time of capture and time of receipt.
 #[derive(Debug, Default)]
 pub struct RoundReports(BTreeMap<(NodeName, Timestamp), Timestamp>);
 
-/// The round that a map or verdicts tell of.
+/// The round of a map or verdicts.
 #[derive(Debug, Clone, Copy)]
 pub struct RoundId<'a> {
     aggregator: &'a NodeName,
@@ -58,12 +59,12 @@ impl Spans {
         }
     }
 
-    /// The same for a node that dates its messages by this clock.
+    /// The same spans for a node that dates its messages by this clock.
     pub fn dated_by(self, clock: CellClock) -> Self {
         Self { clock, ..self }
     }
 
-    /// The way of a frame from its capture on; the root of its trace.
+    /// The path of a frame from its capture on; the root of its trace.
     pub fn frame(&self, captured_at: Timestamp) -> Span {
         info_span!(
             parent: None,
@@ -74,7 +75,7 @@ impl Spans {
         )
     }
 
-    /// Notes a report that the present round has taken.
+    /// Records a report that the current round has used.
     pub fn note(&self, report: &ObjectReport, received_at: Timestamp, reports: &mut RoundReports) {
         if span_enabled!(Level::INFO) {
             reports
@@ -84,8 +85,8 @@ impl Spans {
         }
     }
 
-    /// A round that has just been closed, from its first report on; the root of its trace. Each of its reports gets a
-    /// span in the trace of its frame.
+    /// A round that has just been closed, from its first report on; the root of its trace. Each of
+    /// its reports gets a span in the trace of its frame.
     pub fn round(&self, fused: &Fused, reports: &RoundReports) -> Span {
         let of_map = fused.map.as_ref().map(RoundId::from);
         let Some(round) = of_map.or_else(|| fused.verdicts.as_ref().map(RoundId::from)) else {

@@ -1,4 +1,4 @@
-//! The present troubles of a node, noted by its parts and read by whoever shows them.
+//! The current troubles of a node, recorded by its parts and read by its displays.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -7,24 +7,25 @@ use ecod::wire::Trouble;
 
 use crate::platform::clock;
 
-/// A register that all parts of a node share. News of it are in the log: at first, and hourly while they last.
+/// A register that all parts of a node share. Troubles are logged when they begin, and hourly while
+/// they last.
 #[derive(Debug, Default)]
 pub struct Troubles(Mutex<TroubleRegister>);
 
 impl Troubles {
-    /// Notes a trouble of this node itself.
+    /// Records a trouble of this node itself.
     pub fn note(&self, kind: TroubleKind, cause: &str) {
         let news = self.register().note(kind, None, cause, clock::now());
         log(news);
     }
 
-    /// Notes a trouble of a vehicle, address or host.
+    /// Records a trouble of a vehicle, address or host.
     pub fn note_about(&self, about: &str, kind: TroubleKind, cause: &str) {
         let news = self.register().note(kind, Some(about), cause, clock::now());
         log(news);
     }
 
-    /// The same with a cause that is put into words only if they are needed.
+    /// As `note_about`, with a text of the cause that is created only if it is needed.
     pub fn note_about_with(&self, about: &str, kind: TroubleKind, cause: impl FnOnce() -> String) {
         let news = self
             .register()
@@ -32,7 +33,7 @@ impl Troubles {
         log(news);
     }
 
-    /// Notes a trouble of this node itself, or about another, with a remedy of its own.
+    /// Records a trouble of this node itself, or about another, with a remedy of its own.
     pub fn note_with_remedy(
         &self,
         about: Option<&str>,
@@ -46,12 +47,12 @@ impl Troubles {
         log(news);
     }
 
-    /// Notes that a trouble of this node itself, or about another, is over.
+    /// Records that a trouble of this node itself, or about another, is over.
     pub fn settle(&self, kind: TroubleKind, about: Option<&str>) {
         self.register().settle(kind, about);
     }
 
-    /// Notes that troubles are over that end with a cell: the vehicle has left it.
+    /// Records that troubles that belong to a cell are over, because the vehicle has left it.
     pub fn leave_cell(&self) {
         use TroubleKind::{BrokerRefuses, Description, NoOrigin};
         let mut register = self.register();

@@ -1,4 +1,5 @@
-//! The embedded MQTT broker behind a front end that authenticates, limits and authorises its clients.
+//! The embedded MQTT broker behind a front end that authenticates, limits and authorises its
+//! clients.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -39,6 +40,7 @@ pub enum BrokerHealth {
     Stopped,
     /// Serves clients at this address.
     Serving(SocketAddr),
-    /// Has ended by itself or hangs. The actor ends with this answer, and the node must not lead meanwhile.
+    /// The broker has ended by itself or hangs. The actor ends with this answer, and the node must
+    /// not lead in the meantime.
     Dead,
 }

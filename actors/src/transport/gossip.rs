@@ -54,9 +54,10 @@ pub struct Member {
     pub gossip: SocketAddr,
     /// Address of its broker, if it has one.
     pub broker: Option<SocketAddr>,
-    /// The role it was started with; in a cell with certificates at most that of its own.
+    /// The role with which the node was started; in a cell with certificates, at most the
+    /// certificate's role.
     pub role: Role,
-    /// Its certificate in DER, as it has proven it; `None` in a cell without certificates.
+    /// Its proven certificate in DER; `None` in a cell without certificates.
     pub certificate: Option<Arc<[u8]>>,
 }
 
@@ -70,17 +71,18 @@ pub enum MembershipEvent {
     },
     /// A node does not answer. It is declared down unless it answers soon.
     Suspected {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// A node is down.
     Down {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
-    /// The certificate of a node was revoked or has expired. That the node is down follows.
+    /// The certificate of a node was revoked or has expired. An event that the node is down
+    /// follows.
     Expelled {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// A living node's addresses changed.
@@ -105,10 +107,10 @@ pub enum MembershipEvent {
         about: String,
         /// Kind of the trouble.
         kind: TroubleKind,
-        /// The same in words.
+        /// The trouble as text.
         cause: String,
     },
-    /// Another node has this node's name, and nobody accepts this one.
+    /// Another node has this node's name, and all other nodes accept that node.
     Excluded,
 }
 

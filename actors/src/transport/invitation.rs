@@ -1,4 +1,5 @@
-//! Invitations: how a machine gets a certificate and the cell's key, while its private key stays on it.
+//! Invitations: how a machine gets a certificate and the cell's key, while its private key stays on
+//! it.
 //!
 //! ```text
 //! host                                                     guest
@@ -10,9 +11,9 @@
 //! "kept": the token is used up                       ->
 //! ```
 //!
-//! A token is for one node. It works until the guest has kept what it got, or the host ends. A guest that fails before
-//! can come again. Of all certificates that were given for a token, the last alone stays valid, and only if it was kept. The
-//! guest's clock does not matter.
+//! A token is for one node. It works until the guest has stored its files, or the host ends. A
+//! guest that fails before that can try again. Among all certificates issued for a token, only the
+//! last one stays valid, and only if it was stored. The guest's clock does not matter.
 
 mod guest;
 mod host;
@@ -36,13 +37,13 @@ pub use token::{Token, TokenError};
 /// Maximum length of the host's answer in bytes. A revocation list is the longest part.
 const MAX_REPLY_BYTES: u64 = 4 << 20;
 
-/// Maximum length of a guest's message in bytes; strangers can send one, too.
+/// Maximum length of a guest's message in bytes; unknown hosts can send one, too.
 const MAX_REQUEST_BYTES: u64 = 16 << 10;
 
 /// Maximum time for a conversation; the guest writes its files meanwhile.
 const CONVERSATION_TIME: Duration = Duration::from_secs(10);
 
-/// Name in the host's certificate of one use. The token tells which certificate it is.
+/// Name in the host's single-use certificate. The token identifies the certificate.
 const HOST_NAME: &str = "invitation.ecod.internal";
 
 /// The last message of both.
@@ -66,7 +67,7 @@ enum Reply {
     Refused(String),
 }
 
-/// All that a node needs to take part in a cell, but for its private key.
+/// All data that a node needs to join a cell, except its private key.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Welcome {
     /// Name of the cell.
@@ -81,9 +82,9 @@ pub struct Welcome {
     pub revocation_list: String,
     /// Content of the cell's key file.
     pub cell_key: String,
-    /// Nodes to ask for the cell, as `host:port`.
+    /// Nodes through which to find the cell, as `host:port`.
     pub seeds: Vec<String>,
-    /// The city above the cell, whose vehicles take part in it; absent for a cell that stands alone.
+    /// The city above the cell, whose vehicles may join it; absent for a cell that stands alone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub city: Option<CityFiles>,
 }
@@ -145,7 +146,7 @@ mod tests {
         host_for(wait, &[]).await
     }
 
-    /// The same for others, too.
+    /// As `host`, for several guests.
     async fn host_for(wait: Duration, others: &[&'static str]) -> Scene {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(
@@ -257,7 +258,7 @@ mod tests {
         } = host(SOON).await;
         let first = redeem(&token).await.unwrap();
         let second = redeem(&token).await.unwrap();
-        // It is revoked already, so its word is not the node's.
+        // Its certificate is already revoked, so its message does not count as the node's.
         first.keep().await.unwrap();
         let told = |text: &str| {
             visits
@@ -350,7 +351,7 @@ mod tests {
             matches!(refused, Some(JoinError::Unreachable { .. })),
             "{refused:?}"
         );
-        // Strangers that say nothing take no guest's place.
+        // Silent connections of unknown hosts don't take a guest's place.
         let mut silent = Vec::new();
         for _ in 0..20 {
             silent.push(

@@ -8,11 +8,11 @@
 //! EvidenceSigner      signatures under evidence that is passed on
 //! ```
 //!
-//! Each cell has its own CA, so that certificates of other cells are not valid in it. A city's CA may stand above: it signs
-//! the CAs of cells, and certifies vehicles for all of them. A certificate's common name is the
-//! node's name. An alternative name of kind URI holds its highest role and priority. Only the certificate of a node that
-//! may lead also has [`BROKER_NAME`], which clients verify: a vehicle that never leads cannot pose as a broker, and
-//! addresses may change.
+//! Each cell has its own CA, so that certificates of other cells are not valid in it. A city's CA
+//! may stand above: it signs the CAs of cells, and certifies vehicles for all of them. A
+//! certificate's common name is the node's name. An alternative name of kind URI holds its highest
+//! role and priority. Only the certificate of a node that may lead also has [`BROKER_NAME`], which
+//! clients verify: a vehicle that cannot lead cannot pose as a broker, and addresses may change.
 
 mod attestation;
 mod authority;
@@ -31,13 +31,15 @@ pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external
 pub use evidence::{EvidenceError, EvidenceSigner};
 pub use subject::{CertificateSubject, InvalidCertificate};
 
-/// DNS name in the certificate of every node that may lead, below a domain reserved for private use.
+/// DNS name in the certificate of every node that may lead, below a domain reserved for private
+/// use.
 pub const BROKER_NAME: &str = "broker.ecod.internal";
 
-/// Name by which programs know the door of a node. Nodes do not take it for a broker's.
+/// Name by which programs verify a node's local broker. Nodes do not accept it as a broker's name.
 pub const DOOR_NAME: &str = "door.ecod.internal";
 
-/// Scheme of the URI in a node's certificate that holds its rights, such as `ecod:role=auto;priority=100`.
+/// Scheme of the URI in a node's certificate that holds its rights, such as
+/// `ecod:role=auto;priority=100`.
 const RIGHTS_SCHEME: &str = "ecod:";
 
 /// Separator between a node's name and the rest in the names of observers that use its certificate.

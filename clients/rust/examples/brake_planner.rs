@@ -1,9 +1,10 @@
-//! Brakes for what the cell sees ahead, around corners too; without maps it brakes as well.
+//! Brakes for objects that the cell sees ahead, including around corners; it also brakes without
+//! maps.
 //!
 //! `cargo run -p ecod-client --example brake_planner -- X_M Y_M HEADING_DEG SPEED_MPS`
 //!
-//! A real planner takes pose and speed from its localisation; here they are given. It prints a line when the decision
-//! changes. `ECOD_BROKER`, `ECOD_CELL` and `ECOD_NAME` say where the cell is.
+//! A real planner takes pose and speed from its localisation; here they are given. It prints a line
+//! when the decision changes. The cell is set by `ECOD_BROKER`, `ECOD_CELL` and `ECOD_NAME`.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! A program's part in a cell.
+//! A program's connection to a cell.
 
 use std::collections::BTreeMap;
 use std::env;
@@ -21,29 +21,31 @@ use crate::connection::{ConnectionState, RECEIVED};
 use crate::streams::{ForeignMessage, MessageStream, Streams};
 use crate::{Error, Tls};
 
-/// Where a cell is, and who the program is.
+/// Address of a cell, and identity of the program.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    /// HOST:PORT of a node or broker; without a port 1883, with `tls` 8883.
+    /// HOST:PORT of a node or broker; the default port is 1883, or 8883 with `tls`.
     pub broker: String,
     /// Name of the cell.
     pub cell: String,
-    /// Node beside which the program runs. It reports as `<node>--<part>`.
+    /// Name of the program's node. The program reports as `<node>--<part>`.
     pub node: String,
-    /// Name of the program at its node. If empty, it reports as the node itself, which then must not report.
+    /// Name of the program at its node. If empty, the program reports as the node itself, which
+    /// then must not report.
     pub part: String,
     /// User at an external broker, and password.
     pub login: Option<(String, String)>,
-    /// Certificates; none for plaintext.
+    /// Certificates; `None` for plaintext.
     pub tls: Option<Tls>,
     /// Time for the first login, and for the answer to [`Cell::description`].
     pub timeout: Duration,
 }
 
 impl Default for Settings {
-    /// Settings by the environment: `ECOD_BROKER` (default `localhost`), `ECOD_CELL` (`cell`), `ECOD_NAME` (the
-    /// machine's host name), `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD`; `ECOD_TLS__CA`, `ECOD_TLS__CERTIFICATE` and
-    /// `ECOD_TLS__KEY` are the files of the node beside which the program runs. The part is `rust`, the timeout 10 s.
+    /// Settings by the environment: `ECOD_BROKER` (default `localhost`), `ECOD_CELL` (`cell`),
+    /// `ECOD_NAME` (the machine's host name), `ECOD_MQTT__USER` and `ECOD_MQTT__PASSWORD`;
+    /// `ECOD_TLS__CA`, `ECOD_TLS__CERTIFICATE` and `ECOD_TLS__KEY` are the files of the program's
+    /// node. The part is `rust`, the timeout 10 s.
     fn default() -> Self {
         let setting = |name| env::var(name).ok().filter(|value| !value.is_empty());
         let or = |name, default: &str| setting(name).unwrap_or_else(|| default.to_owned());
@@ -65,7 +67,7 @@ impl Default for Settings {
     }
 }
 
-/// What one frame shows. One without objects is a report, too.
+/// Content of one frame. A frame without objects is a report, too.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
     /// Time of the picture, not of the detection.
@@ -74,7 +76,7 @@ pub struct Frame {
     pub objects: Vec<PerceivedObject>,
     /// Pose of the camera. With it, the reporting vehicle itself is on the map.
     pub pose: Option<WirePose>,
-    /// Known locations in view.
+    /// Landmarks in view.
     pub seen: Option<Vec<LandmarkId>>,
     /// Field of view from the pose.
     pub view: Option<FieldOfView>,
@@ -96,7 +98,8 @@ impl Frame {
     }
 }
 
-/// A connection to a cell, which is made anew whenever it is lost. Its methods may be called from any thread.
+/// A connection to a cell, which is re-established whenever it is lost. Its methods may be called
+/// from any thread.
 pub struct Cell {
     name: NodeName,
     topics: Topics,
@@ -106,9 +109,10 @@ pub struct Cell {
     timeout: Duration,
 }
 
-/// An endless loop over messages; made by [`Cell::maps`] and its like.
+/// An endless iterator over messages, returned by [`Cell::maps`] and similar methods.
 ///
-/// A slow reader gets the newest message next, and never a backlog. The loop ends when the cell is closed.
+/// A slow reader gets the newest message next and no backlog. The iterator ends when the cell is
+/// closed.
 pub struct Messages<M> {
     shared: Arc<ConnectionState>,
     filter: String,
@@ -117,16 +121,17 @@ pub struct Messages<M> {
     timeout: Option<Duration>,
 }
 
-/// Keep-alive as the default of nodes.
+/// Keep-alive, equal to the default of nodes.
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
 
-/// Messages that await an acknowledgement: questions, which are asked one at a time.
+/// Maximum number of unacknowledged messages. Only requests need an acknowledgement, and they are
+/// sent one at a time.
 const MAX_UNDER_WAY: u16 = 16;
 
-/// Silence after which the log says where to look.
+/// Silence after which the log gives a hint about the cause.
 const SILENCE: Duration = Duration::from_secs(10);
 
-/// Longest wait of a reader between two looks at the clock.
+/// Longest wait of a reader between two checks of its timeout.
 const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Room in a packet for topic and header in bytes.
@@ -136,8 +141,9 @@ impl Cell {
     /// Connects to a cell.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for settings that no broker could use, [`Error::Unreachable`] or [`Error::Refused`] unless the
-    /// broker lets the program in within the timeout.
+    /// Returns [`Error::Invalid`] for settings that no broker could accept, and
+    /// [`Error::Unreachable`] or [`Error::Refused`] if the broker does not admit the program within
+    /// the timeout.
     pub fn connect(settings: Settings) -> Result<Self, Error> {
         let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
         let part = if settings.part.is_empty() {
@@ -155,8 +161,8 @@ impl Cell {
         } else {
             address.host()
         };
-        // With certificates a cell's broker takes ids of this form only, by which nobody ends another's session. Without,
-        // it takes them for nodes'.
+        // With certificates a cell's broker accepts only ids of this form, so that a program cannot
+        // end another's session. Without, it treats them as ids of nodes.
         let mut run = Uuid::new_v4().simple().to_string();
         if settings.tls.is_none() {
             run.truncate(16);
@@ -165,7 +171,7 @@ impl Cell {
         let limits = Limits::default();
         options.set_keep_alive(KEEP_ALIVE).set_clean_start(true);
         options.set_connection_timeout(settings.timeout.as_secs().clamp(1, 10));
-        // Memory is taken for each, by default 14 MB.
+        // Memory is allocated for each, by default 14 MB.
         options.set_outgoing_inflight_upper_limit(MAX_UNDER_WAY);
         options.set_max_packet_size(u32::try_from(limits.map_bytes + HEADER_BYTES).ok());
         let mut network = rumqttc::NetworkOptions::new();
@@ -199,7 +205,8 @@ impl Cell {
         &self.name
     }
 
-    /// The maps of the cell, from now on. One that is not later by epoch and round than the last is dropped.
+    /// The maps of the cell, from now on. A map that is not later than the last one by epoch and
+    /// round is dropped.
     pub fn maps(&self) -> Messages<GlobalMap> {
         self.read("global_detections", |streams| &streams.maps, false)
     }
@@ -209,12 +216,13 @@ impl Cell {
         self.read("global_verdicts", |streams| &streams.verdicts, false)
     }
 
-    /// The trust in each vehicle: the present state first, then by the rules of [`Cell::maps`].
+    /// The reputation of each vehicle: the current state first, then by the rules of
+    /// [`Cell::maps`].
     pub fn reputations(&self) -> Messages<Reputations> {
         self.read("reputations", |streams| &streams.reputations, true)
     }
 
-    /// The statuses of the nodes: the present ones first, then every change.
+    /// The statuses of the nodes: the current ones first, then every change.
     pub fn statuses(&self) -> Messages<NodeStatus> {
         self.read("nodes/+", |streams| &streams.statuses, true)
     }
@@ -224,24 +232,27 @@ impl Cell {
         self.read("detections/+", |streams| &streams.reports, false)
     }
 
-    /// The collective perception messages (CPM) of other stations, from now on: of each receiver the newest.
+    /// The collective perception messages (CPM) of other stations, from now on: of each receiver
+    /// the newest.
     pub fn received_cpms(&self) -> Messages<ForeignMessage> {
         self.read(&format!("{RECEIVED}/+"), |streams| &streams.foreign, false)
     }
 
-    /// Publishes a collective perception message (CPM) on `cpm/<level>`, as [`Cell::report`] does a report.
+    /// Publishes a collective perception message (CPM) on `cpm/<level>`, as [`Cell::report`] does a
+    /// report.
     ///
     /// # Errors
-    /// [`Error::Refused`] when the broker refused the login or an earlier message there.
+    /// Returns [`Error::Refused`] if the broker refused the login or an earlier message there.
     pub fn publish_cpm(&self, level: &str, payload: Vec<u8>) -> Result<bool, Error> {
         self.publish(&self.topics.cpm(level), payload)
     }
 
-    /// The settings that all nodes of the cell share, as they are now; version 0 if there are none.
+    /// The current settings that all nodes of the cell share; version 0 if there are none.
     ///
     /// # Errors
-    /// [`Error::Silent`] if nothing comes within the timeout: a node always tells the programs beside it, other brokers have
-    /// nothing in a cell without a description. [`Error::Refused`] when the broker refuses.
+    /// Returns [`Error::Silent`] if no description arrives within the timeout. A node always sends
+    /// it to its local programs, but other brokers have none in a cell without a description.
+    /// Returns [`Error::Refused`] if the broker refuses the subscription.
     pub fn description(&self) -> Result<Arc<CellDescription>, Error> {
         let mut descriptions = self
             .read("cell", |streams| &streams.descriptions, true)
@@ -255,10 +266,12 @@ impl Cell {
         descriptions.next().unwrap_or_else(closed)
     }
 
-    /// The place of the cell's maps on Earth, if the cell's description has one. It may change while the cell runs.
+    /// The place of the cell's maps on Earth, if the cell's description has one. It may change
+    /// while the cell runs.
     ///
     /// # Errors
-    /// As [`Cell::description`], and [`Error::Invalid`] for one that cannot be read.
+    /// Returns the errors of [`Cell::description`], and [`Error::Invalid`] for an unreadable
+    /// description.
     pub fn origin(&self) -> Result<Option<GeographicOrigin>, Error> {
         let description = self.description()?;
         let invalid = |error: &dyn std::fmt::Display| {
@@ -276,20 +289,20 @@ impl Cell {
         Ok(Some(origin))
     }
 
-    /// Reports a frame, for the map. Gives whether it was sent: without a connection it is dropped and counted. It never
-    /// waits.
+    /// Reports a frame, for the map. Returns true if it was sent; without a connection it is
+    /// dropped and counted. This method does not block.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for values that the protocol does not allow. [`Error::Refused`] when the broker refused the
-    /// login or an earlier report.
+    /// Returns [`Error::Invalid`] for values that the protocol does not allow, and
+    /// [`Error::Refused`] if the broker refused the login or an earlier report.
     pub fn report(&self, frame: Frame) -> Result<bool, Error> {
         self.send(ReportKind::Detections, frame)
     }
 
-    /// Votes on what is at known locations, for the verdicts: objects name their `landmark`.
+    /// Votes on the labels at landmarks, for the verdicts: objects name their `landmark`.
     ///
     /// # Errors
-    /// As [`Cell::report`], and when an object names no location.
+    /// Returns the errors of [`Cell::report`], and an error if an object names no landmark.
     pub fn vote(&self, frame: Frame) -> Result<bool, Error> {
         if let Some(place) = frame
             .objects
@@ -303,12 +316,13 @@ impl Cell {
         self.send(ReportKind::VoteDetections, frame)
     }
 
-    /// Messages that were not taken, by the reasons in `docs/protocol.md`, and reports that were not sent: `unsent`.
+    /// Messages that were not accepted, by the reasons in `docs/protocol.md`, and reports that were
+    /// not sent: `unsent`.
     pub fn counts(&self) -> BTreeMap<&'static str, u64> {
         self.shared.state().counts.clone()
     }
 
-    /// Ends the connection, and with it all loops over messages. Dropping the cell does the same.
+    /// Ends the connection and all iterators over messages. Dropping the cell has the same effect.
     pub fn close(&self) {
         self.shared.close();
     }
@@ -391,7 +405,8 @@ impl Drop for Cell {
 }
 
 impl<M> Messages<M> {
-    /// The same loop, in which silence of this length gives [`Error::Silent`]. A vehicle should stop then.
+    /// The same iterator, in which silence of this length returns [`Error::Silent`]. A vehicle
+    /// should stop in this case.
     #[must_use]
     pub fn timeout(mut self, silence: Duration) -> Self {
         self.timeout = Some(silence);
@@ -402,12 +417,12 @@ impl<M> Messages<M> {
 impl<M> Iterator for Messages<M> {
     type Item = Result<Arc<M>, Error>;
 
-    /// Waits for the next message. After an error the loop may go on.
+    /// Waits for the next message. After an error, iteration may continue.
     fn next(&mut self) -> Option<Self::Item> {
         let (began, mut is_told) = (Instant::now(), false);
         let mut state = self.shared.state();
         while !state.is_closing {
-            // Asked for anew after a refusal.
+            // Subscribed again after a refusal.
             state.subscribe(&self.filter);
             if let Some((number, message)) = (self.stream)(&state.streams).after(self.number) {
                 self.number = number;
@@ -419,7 +434,7 @@ impl<M> Iterator for Messages<M> {
             let waited = began.elapsed();
             let remedy = match state.is_connected() {
                 false => "no connection",
-                // A status comes with a change alone.
+                // A status is sent only when it changes.
                 true if self.number > 0 && self.filter.ends_with("/nodes/+") => {
                     "nothing has changed since the last"
                 }
@@ -436,7 +451,8 @@ impl<M> Iterator for Messages<M> {
             }
             if waited >= SILENCE && !is_told {
                 is_told = true;
-                // Maps never end, and a lost connection has a remedy; vehicles and other stations may have nothing to say.
+                // Maps are expected without end, and a lost connection has a remedy; vehicles and
+                // other stations may be silent for good reason.
                 let is_fault = !state.is_connected() || self.filter.contains("/global_");
                 log::log!(
                     if is_fault {
@@ -490,7 +506,8 @@ fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error>
     address.map_err(|error| Error::Invalid(error.to_string()))
 }
 
-/// The machine's name without its domain, as far as names of nodes may have its characters: as nodes do it.
+/// The machine's name without its domain, limited to characters allowed in names of nodes, by the
+/// same rule as for nodes.
 fn host_name() -> String {
     let system = rustix::system::uname();
     let host = system.nodename().to_string_lossy();

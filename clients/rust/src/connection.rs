@@ -1,4 +1,4 @@
-//! A connection to a broker on a thread of its own, made anew whenever it is lost.
+//! A connection to a broker on its own thread, which re-establishes it whenever it is lost.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -16,7 +16,7 @@ use uuid::Uuid;
 use crate::Error;
 use crate::streams::Streams;
 
-/// What the connection's thread and the program share.
+/// State shared by the connection's thread and the program.
 pub(crate) struct ConnectionState {
     /// Address of the broker as given, for messages.
     pub(crate) at: String,
@@ -32,23 +32,24 @@ pub(crate) struct State {
     pub(crate) streams: Streams,
     pub(crate) counts: BTreeMap<&'static str, u64>,
     pub(crate) is_closing: bool,
-    /// The sending half while the broker lets the program in.
+    /// The sending half while the program is logged in.
     client: Option<Client>,
     /// Outcome of the first login.
     login: Option<Result<(), Error>>,
-    /// Refusal of the latest login, if the broker will refuse the next one, too.
+    /// Refusal of the latest login, if the broker will also refuse the next one.
     refusal: Option<Error>,
     filters: BTreeSet<String>,
-    /// Topics and filters that the broker was asked for on this connection.
+    /// Topics and filters requested from the broker on this connection.
     asked: BTreeSet<String>,
-    /// Those under way, in order, and by packet once they are sent.
+    /// Requests in progress, in order, and by packet once they are sent.
     queued: VecDeque<String>,
     unanswered: HashMap<u16, String>,
     denied: HashMap<String, String>,
     has_ended: bool,
 }
 
-/// Messages that wait for the network at most; more are dropped, as late ones are worthless.
+/// Maximum number of messages that wait for the network; more are dropped, because late messages
+/// are worthless.
 const MAX_WAITING: usize = 16;
 
 /// Topic below which receivers bring collective perception messages (CPM) of other stations.
@@ -58,11 +59,11 @@ pub(crate) const RECEIVED: &str = "cpm/received";
 const RETRY_MIN: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
-/// Time to send what waits when the connection is closed.
+/// Time for sending queued messages when the connection is closed.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl ConnectionState {
-    /// Connects, and waits until the broker lets the program in.
+    /// Connects, and waits until the program is logged in.
     pub(crate) fn connect(
         at: String,
         topics: Topics,
@@ -115,7 +116,7 @@ impl ConnectionState {
             .0
     }
 
-    /// Sends what waits, and ends the connection and all loops over messages.
+    /// Sends queued messages, and ends the connection and all iterators over messages.
     pub(crate) fn close(&self) {
         let mut state = self.state();
         state.is_closing = true;
@@ -131,11 +132,12 @@ impl ConnectionState {
         self.changed.notify_all();
     }
 
-    /// Carries messages until the program closes the connection.
+    /// Transfers messages until the program closes the connection.
     fn run(&self, options: &MqttOptions) {
         let mut wait = RETRY_MIN;
         loop {
-            // A client of its own for each connection: what waited in the last one is too old.
+            // Each connection has a new client, because messages queued in the last one are too
+            // old.
             let (client, mut connection) = Client::new(options.clone(), MAX_WAITING);
             let began = Instant::now();
             let lost = self.carry(&client, &mut connection);
@@ -146,7 +148,8 @@ impl ConnectionState {
                     self.at
                 );
             }
-            // A broker that lets the program in only to end the connection is not asked more and more often.
+            // A broker that admits the program and then ends the connection is not contacted more
+            // and more often.
             wait = if began.elapsed() > RETRY_MAX {
                 RETRY_MIN
             } else {
@@ -165,7 +168,7 @@ impl ConnectionState {
         }
     }
 
-    /// Sends and receives until the connection ends; gives the reason.
+    /// Sends and receives until the connection ends; returns the reason.
     fn carry(&self, client: &Client, connection: &mut Connection) -> String {
         loop {
             let event = match connection.recv() {
@@ -212,7 +215,7 @@ impl ConnectionState {
                 _ => continue,
             }
             if state.is_closing && state.client.take().is_some() {
-                // It was closed while the broker was asked.
+                // The connection was closed during the request.
                 client.try_disconnect().unwrap_or_default();
             }
             drop(state);
@@ -220,7 +223,7 @@ impl ConnectionState {
         }
     }
 
-    /// Takes a message. An unusable one is counted, and told of once.
+    /// Processes a message. An unusable one is counted, and the first of its kind is logged.
     fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
         let text = std::str::from_utf8(topic).ok();
         let received = text.and_then(|topic| topic.strip_prefix(&self.topics.filter(RECEIVED)));
@@ -236,7 +239,7 @@ impl ConnectionState {
         let Err(reason) = taken else { return };
         let count = state.counts.entry(reason.as_str()).or_default();
         *count += 1;
-        // An order that is not kept is usual after a reconnection.
+        // Old rounds are normal after a reconnection.
         if *count == 1 && reason != RejectReason::Superseded {
             let topic = String::from_utf8_lossy(topic);
             log::warn!("not taken from {topic}: {reason}; others like it are only counted");
@@ -266,7 +269,7 @@ impl ConnectionState {
 }
 
 impl State {
-    /// Notes that the broker lets the program in.
+    /// Records that the program is logged in.
     fn begin(&mut self, client: &Client) {
         (self.refusal, self.client) = (None, Some(client.clone()));
         self.login.get_or_insert(Ok(()));
@@ -284,7 +287,7 @@ impl State {
         self.client.is_some()
     }
 
-    /// Asks for messages, on this connection and all that follow.
+    /// Subscribes to messages, on this connection and all later ones.
     pub(crate) fn subscribe(&mut self, filter: &str) {
         self.filters.insert(filter.to_owned());
         let Some(client) = &self.client else { return };
@@ -293,12 +296,13 @@ impl State {
         }
     }
 
-    /// Sends a message if that is possible at once; gives whether it is.
+    /// Sends a message if that is possible at once; returns whether it was sent.
     pub(crate) fn publish(&mut self, topic: &str, payload: Vec<u8>) -> bool {
         let Some(client) = &self.client else {
             return false;
         };
-        // The first message asks for an answer: nothing else says that the broker does not allow them.
+        // The first message requests an acknowledgement, because a refusal by the broker is not
+        // visible otherwise.
         let is_question = !self.asked.contains(topic);
         let qos = if is_question {
             QoS::AtLeastOnce
@@ -312,7 +316,8 @@ impl State {
         is_sent
     }
 
-    /// Gives what the broker refused: the login, or this topic or filter, each refusal of it once.
+    /// Returns a refusal of the broker: of the login, or of this topic or filter. Each refusal of a
+    /// topic is returned once.
     pub(crate) fn check_refusal(&mut self, topic: &str, at: &str) -> Result<(), Error> {
         if let Some(refusal) = &self.refusal {
             return Err(refusal.clone());
@@ -363,7 +368,7 @@ fn is_final(code: ConnectReturnCode) -> bool {
     )
 }
 
-/// An error's text with those of its causes.
+/// An error's text together with the texts of its causes.
 fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     for cause in

@@ -1,4 +1,5 @@
-//! The newest payloads of each topic, for any number of readers, none of whom holds up the others or the network.
+//! The newest payloads of each topic, for any number of readers, which do not hold up each other or
+//! the network.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -25,7 +26,7 @@ pub(crate) struct Streams {
     pub(crate) foreign: MessageStream<ForeignMessage>,
 }
 
-/// A message of a station that is no node, in its own language.
+/// A message of another station that is not a node, in its own format.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ForeignMessage {
     /// Name of the receiver that brought it: the last level of its topic.
@@ -34,7 +35,7 @@ pub struct ForeignMessage {
     pub payload: Vec<u8>,
 }
 
-/// One kind of payload: the newest, of statuses the newest of each node.
+/// One kind of payload: the newest, or for statuses the newest of each node.
 #[derive(Debug)]
 pub(crate) struct MessageStream<M> {
     newest: BTreeMap<Option<NodeName>, (u64, Arc<M>)>,
@@ -43,14 +44,15 @@ pub(crate) struct MessageStream<M> {
     admitted_at: Option<Instant>,
 }
 
-/// Nodes whose statuses are kept; beyond that the one that was heard longest ago gives way.
+/// Maximum number of nodes whose statuses are kept; the node whose status is oldest is replaced
+/// first.
 const MAX_NODES: usize = 1024;
 
-/// Aggregator of reputations that name none.
+/// Placeholder aggregator of reputations without one.
 const UNNAMED: NodeName = NodeName::from_static("-");
 
 impl Streams {
-    /// Takes a payload. One that is rejected changes nothing.
+    /// Processes a payload. A rejected payload has no effect.
     pub(crate) fn take(
         &mut self,
         topic: Option<Topic>,
@@ -97,7 +99,7 @@ impl Streams {
         }
     }
 
-    /// Takes a message of a station that is no node.
+    /// Processes a message of a station that is not a node.
     pub(crate) fn take_foreign(
         &mut self,
         receiver: NodeName,
@@ -129,7 +131,7 @@ impl<M> Default for MessageStream<M> {
 }
 
 impl<M> MessageStream<M> {
-    /// Takes a round, unless it is earlier than the last by epoch, aggregator and number.
+    /// Stores a round, unless it is earlier than the last one by epoch, aggregator and number.
     fn take(
         &mut self,
         payload: &[u8],
@@ -145,7 +147,7 @@ impl<M> MessageStream<M> {
             .admitted_at
             .is_some_and(|at| now.duration_since(at) >= EPOCH_MEMORY)
         {
-            // The cell may have begun anew.
+            // The cell may have restarted.
             self.gate = EpochGate::default();
         }
         self.gate.admit(
@@ -175,7 +177,7 @@ impl<M> MessageStream<M> {
         self.number
     }
 
-    /// The earliest of the newest payloads that came after the numbered one.
+    /// The earliest of the newest payloads that arrived after the numbered one.
     pub(crate) fn after(&self, number: u64) -> Option<(u64, Arc<M>)> {
         self.newest
             .values()

@@ -1,4 +1,4 @@
-//! TLS with brokers that are known by a name and not by their address.
+//! TLS with brokers that are identified by a name instead of their address.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,9 +14,10 @@ use crate::Error;
 /// Certificates of a program, in PEM files.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tls {
-    /// Certificates that a broker must descend from.
+    /// Certificate authorities of which one must have signed the broker's certificate chain.
     pub ca: PathBuf,
-    /// Certificate and key by which the broker knows the program: those of its node.
+    /// Certificate and key of the program's node, with which the program authenticates to the
+    /// broker.
     pub identity: Option<(PathBuf, PathBuf)>,
     /// Name in the broker's certificate; without it, the host of the address.
     pub broker_name: Option<String>,
@@ -26,10 +27,10 @@ impl Tls {
     /// Name of the broker of a node that may lead.
     pub const BROKER_NAME: &'static str = "broker.ecod.internal";
 
-    /// Name of the door of every node.
+    /// Name of the local broker of every node.
     pub const DOOR_NAME: &'static str = "door.ecod.internal";
 
-    /// TLS with the door of any node, by the files of the program's own node.
+    /// TLS with the local broker of any node, using the files of the program's own node.
     pub fn of_door(
         ca: impl Into<PathBuf>,
         certificate: impl Into<PathBuf>,
@@ -43,7 +44,7 @@ impl Tls {
         }
     }
 
-    /// TLS with the broker of a node that may lead, by the files of the program's own node.
+    /// TLS with the broker of a node that may lead, using the files of the program's own node.
     pub fn of_cell(
         ca: impl Into<PathBuf>,
         certificate: impl Into<PathBuf>,

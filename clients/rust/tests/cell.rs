@@ -1,4 +1,4 @@
-//! A program's part in cells of real nodes, and at a real broker that says anything.
+//! A program in cells of real nodes, and at a real broker that sends arbitrary messages.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
@@ -23,7 +23,7 @@ use ecod_client::{
 use rumqttc::{Client, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
-/// Maximum time for anything on a machine that does much else.
+/// Maximum time for any step on a busy machine.
 const SOON: Duration = Duration::from_secs(30);
 
 fn loopback() -> SocketAddr {
@@ -53,7 +53,7 @@ fn config(name: &'static str, role: Role) -> NodeConfig {
     config
 }
 
-/// A running node and its door.
+/// A running node and its local broker.
 struct Node {
     runtime: Runtime,
     handle: Option<NodeHandle>,
@@ -313,7 +313,7 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
         std::thread::sleep(Duration::from_millis(20));
     };
     assert_eq!(cell.description().unwrap().set_by.as_str(), "edge");
-    // As PROJ has it, for 12.4 m east and 3.1 m south.
+    // By PROJ, for 12.4 m east and 3.1 m south.
     let (latitude_deg, longitude_deg) = (52.22964774062, 21.01241017960);
     let pose = GeographicPose {
         latitude_deg,
@@ -405,7 +405,7 @@ fn what_the_door_refuses_the_program_learns() {
     assert!(cell.report(frame()).is_ok(), "each refusal is told once");
 }
 
-/// A broker that takes anything, and a client that says anything.
+/// A broker that accepts any message, and a client that sends arbitrary messages.
 fn broker() -> (EmbeddedBroker, SocketAddr) {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = broker.start(loopback()).unwrap();
@@ -428,7 +428,7 @@ fn map(epoch: u64, round: u64) -> Vec<u8> {
     encode(&map, Encoding::Json)
 }
 
-/// A request to a node, which numbers it, or what another broker retains.
+/// A request to a node, which numbers it, or the message that another broker retains.
 fn description(text: &str) -> Vec<u8> {
     let set_by = NodeName::from_static("edge");
     let hash = ContentHash::default();
@@ -594,7 +594,8 @@ fn example(name: &str) -> PathBuf {
     build.join("examples").join(name)
 }
 
-/// The program that a page of the documentation shows, if it is this example but for its first lines.
+/// The program that a page of the documentation shows, if it is this example but for its first
+/// lines.
 fn is_shown(page: &str, example: &str) -> bool {
     let read = |path: &str| {
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()

@@ -1,4 +1,4 @@
-//! Places at which a cell itself has lately detected something.
+//! Places at which the cell itself has recently detected an object.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -7,17 +7,18 @@ use ecod_client::{NodeName, ObjectReport};
 
 use crate::cpm;
 
-/// Time for which a detection shows that the cell knows of an object by itself.
+/// Time after a detection for which an object counts as detected by the cell itself.
 const SIGHTED_FOR: Duration = Duration::from_secs(2);
 
-/// Distance in metres from a detection within which an object is the one that was detected, at any speed and with any error of pose.
+/// Distance in metres from a detection within which an object counts as the detected one, at any
+/// speed and with any error of pose.
 const SIGHTED_M: f64 = 5.0;
 
 /// Time after a foreign station's last report in which the cell may still have its objects.
 const FOREIGN_FOR: Duration = Duration::from_secs(10);
 
-/// Detections of the cell's own vehicles, and whether those of other stations are reported beside them. A map does not say by which
-/// of a node's parts it has an object.
+/// Detections of the cell's own vehicles, and whether other stations' objects are reported at the
+/// same time. A map does not state which part of a node has reported an object.
 #[derive(Debug, Default)]
 pub(super) struct Sightings {
     own: BTreeMap<NodeName, (Instant, Vec<[f64; 2]>)>,
@@ -25,7 +26,7 @@ pub(super) struct Sightings {
 }
 
 impl Sightings {
-    /// Takes a report for the map.
+    /// Processes a report for the map.
     pub(super) fn observe(&mut self, report: &ObjectReport, now: Instant) {
         self.own
             .retain(|_, (at, _)| now.duration_since(*at) < SIGHTED_FOR);
@@ -41,7 +42,7 @@ impl Sightings {
         self.own.insert(report.node.clone(), (now, places));
     }
 
-    /// False for a place at which foreign stations alone can have detected an object.
+    /// False for a place at which only other stations can have detected an object.
     pub(super) fn is_sighted(&self, [x_m, y_m]: [f64; 2], now: Instant) -> bool {
         let is_alone = self
             .foreign

@@ -10,20 +10,20 @@ use super::CpmRefusal;
 /// Maximum number of other stations at a time. A node has room for 16 parts.
 pub(super) const MAX_OTHER_STATIONS: usize = 12;
 
-/// Silence after which a station gives its place to another.
+/// Silence after which a station's place may go to another station.
 const STATION_RETENTION: Duration = Duration::from_secs(10);
 
-/// Time between two reports of all stations together. The node's door takes 50 reports a second of all its programs, and a vehicle's
-/// own detector needs most of them.
+/// Time between two reports of all stations together. The node's local broker accepts 50 reports a
+/// second from all its programs, and a vehicle's own detector needs most of them.
 const REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
-/// The stations that are heard, by number.
+/// The active stations, by number.
 #[derive(Debug, Default)]
 pub(super) struct StationPlaces(BTreeMap<u32, StationPlace>);
 
 #[derive(Debug)]
 struct StationPlace {
-    /// The first that has brought it, as long as it does.
+    /// The receiver that first delivered the station, as long as it continues to do so.
     receiver: NodeName,
     heard_at: Instant,
     /// When its next report is due.
@@ -31,7 +31,8 @@ struct StationPlace {
 }
 
 impl StationPlaces {
-    /// Gives a station its place. Where there is none, a receiver with more stations than the others gives way.
+    /// Gives a station a place. If there is none left, a station of the receiver with most stations
+    /// is removed.
     pub(super) fn enter(
         &mut self,
         number: u32,
@@ -73,7 +74,8 @@ impl StationPlaces {
         Ok(())
     }
 
-    /// False if there is no room for a report of a station now. One that comes a little early has its next due later.
+    /// Returns false if there is no room for a report of the station now. If a report comes
+    /// slightly early, the station's next report is due later.
     pub(super) fn take_room(&mut self, number: u32, now: Instant) -> bool {
         let counts = self.counts();
         let receivers = counts.len();

@@ -6,7 +6,7 @@ use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd::{
     VruSubProfilePedestrian,
 };
 
-/// Vehicles by `TrafficParticipantType`; the first label of a type is the one that a received message gets.
+/// Vehicles by `TrafficParticipantType`; the first label of a type is used for received messages.
 const VEHICLES: [(&str, u8); 12] = [
     ("vehicle", 0),
     ("car", 5),
@@ -63,7 +63,8 @@ pub(super) fn label(class: &ObjectClass) -> &'static str {
             LightVehicle(profile),
         )) => {
             match profile {
-                // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see the person.
+                // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see
+                // the person.
                 2 | 4..=6 => "person",
                 // Horse and rider.
                 3 => "animal",

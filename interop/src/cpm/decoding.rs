@@ -17,14 +17,16 @@ use super::{
     SIGMAS, UNSTATED_COORDINATE, classes,
 };
 
-/// Confidence of an object of which the station states none.
+/// Confidence of an object for which the station states none.
 const UNSTATED_CONFIDENCE: f64 = 0.5;
 
-/// Half width of a coordinate's interval in metres where the station states none: wide, so that others count more.
+/// Half width in metres of a coordinate's interval if the station states none: wide, so that other
+/// reports have more weight.
 const UNSTATED_HALF_WIDTH_M: f64 = 10.0;
 
-/// Greatest time in milliseconds between a measurement and the reference time: the longest period of messages. An object
-/// that its station has not measured for longer is the station's guess, which the report would date anew.
+/// Maximum time in milliseconds between a measurement and the reference time: the longest period of
+/// messages. An object that was not measured for longer is an extrapolation of the station, and the
+/// report would give it a new date.
 const MAX_DELTA_MS: u16 = 1000;
 
 /// Code of a speed's confidence that is out of range: the standard calls such a speed not valid.
@@ -33,7 +35,7 @@ const WIDE_SPEED: u8 = 126;
 /// The objects of a message in the frame of a cell.
 ///
 /// # Errors
-/// [`CpmError`] for what is no CPM, or is not in the neighbourhood.
+/// Returns a [`CpmError`] if the bytes are not a CPM, or the message is not from the neighbourhood.
 pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, CpmError> {
     if bytes.len() > MAX_BYTES {
         return Err(CpmError::TooLarge);
@@ -137,7 +139,7 @@ fn perceived(
     })
 }
 
-/// A coordinate in metres; `None` for the codes of those out of range.
+/// A coordinate in metres; `None` for the out-of-range codes.
 fn metres(coordinate: &cdd::CartesianCoordinateWithConfidence) -> Option<f64> {
     let centimetres = coordinate.value.0;
     COORDINATES_CM

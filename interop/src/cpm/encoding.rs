@@ -26,17 +26,20 @@ use crate::object::CellObject;
 /// Maximum number of objects in a message.
 const MAX_OBJECTS: usize = 255;
 
-/// Width of a tile in metres: from its centre to the far corner of the next is less than a message can state.
+/// Width of a tile in metres: from its centre to the far corner of the next is less than a message
+/// can state.
 const TILE_M: f64 = 600.0;
 
 /// Greatest age that a message states, in milliseconds: at least so old.
 const MAX_AGE_MS: u16 = 1500;
 
-/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands. `is_sighted` tells by
-/// position (metres) whether the cell itself knows of an object there; the others are left out.
+/// A map as the message of a roadside unit: its objects, and landmarks at which a road user stands.
+/// `is_sighted` returns for a position (metres) whether the cell itself has detected an object
+/// there; other objects are left out.
 ///
 /// # Errors
-/// [`CpmError::NoTime`] before 2004, [`CpmError::TooFar`] if all objects are far from the origin, [`CpmError::Unencodable`].
+/// Returns [`CpmError::NoTime`] before 2004, [`CpmError::TooFar`] if all objects are far from the
+/// origin, or [`CpmError::Unencodable`].
 pub fn encode_map(
     map: &GlobalMap,
     cell: &CpmCell,
@@ -93,11 +96,11 @@ pub fn encode_map(
     )
 }
 
-/// A vehicle's report as its message. A report without a pose is that of a roadside unit. Detections are no tracks: an object
-/// has a new number in every message, for 256 reports.
+/// A vehicle's report as its message. A report without a pose becomes the message of a roadside
+/// unit. Detections are not tracks: an object has a new number in every message, for 256 reports.
 ///
 /// # Errors
-/// As [`encode_map`].
+/// Returns the errors of [`encode_map`].
 pub fn encode_report(
     report: &ObjectReport,
     cell: &CpmCell,
@@ -142,7 +145,7 @@ pub fn encode_report(
     encode(station_id, report.captured_at_us, &frame, station, sources)
 }
 
-/// An object, with what a message says of it besides.
+/// An object with the additional data of a message.
 #[derive(Debug)]
 struct CpmObject<'a> {
     object: CellObject<'a>,
@@ -159,7 +162,8 @@ fn age_ms(object: &FusedObject, map: &GlobalMap) -> Option<u16> {
     Some(u16::try_from(age).unwrap_or(MAX_AGE_MS).min(MAX_AGE_MS))
 }
 
-/// Time of an object's last detection after that of the map. Its least value also means "or earlier".
+/// Time of an object's last detection relative to the time of the map. Its minimum value also means
+/// "or earlier".
 fn delta_ms(object: &FusedObject) -> i16 {
     (object.age_s.unwrap_or(0.0) * -1000.0)
         .round()
@@ -177,8 +181,8 @@ impl<'a> CpmObject<'a> {
         }
     }
 
-    /// The object as a message has it, where it was when it was last detected; `None` if that is too far from the reference
-    /// position.
+    /// The object in a message's form, at the place of its last detection; `None` if that is too
+    /// far from the reference position.
     fn perceived(&self, frame: &MessageFrame) -> Option<cdd::PerceivedObject> {
         let ([x_m, y_m], [east_mps, north_mps]) = (
             self.object.position_m,
@@ -245,7 +249,8 @@ impl<'a> CpmObject<'a> {
         ))
     }
 
-    /// The eight most probable classes, or the only one without a confidence. Labels of one class add up.
+    /// The eight most probable classes, or the only one without a confidence. Labels of one class
+    /// add up.
     fn classification(&self) -> cdd::ObjectClassDescription {
         let mut classes: Vec<(cdd::ObjectClass, f64)> = Vec::new();
         for (label, score) in self.object.scores {
@@ -323,8 +328,8 @@ fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
     rasn::uper::encode(value).map_err(|_| CpmError::Unencodable)
 }
 
-/// The centre of the tile that, with its neighbours, holds most objects; of several, the nearest to the origin. All objects of
-/// these nine tiles are near enough for a message.
+/// The centre of the tile that, with its neighbours, holds most objects; of several, the nearest to
+/// the origin. All objects of these nine tiles are near enough for a message.
 fn centre(sources: &[CpmObject<'_>]) -> (f64, f64) {
     let mut counts: BTreeMap<(i64, i64), usize> = BTreeMap::new();
     for [x_m, y_m] in sources.iter().map(|source| source.object.position_m) {
@@ -360,7 +365,7 @@ fn coordinate(
         })
 }
 
-/// A component of a velocity; beyond the range the codes that say so.
+/// A component of a velocity; out of range, the corresponding code.
 fn velocity_component(mps: f64) -> cdd::VelocityComponent {
     let value =
         cdd::VelocityComponentValue((mps * 100.0).round().clamp(-16_383.0, 16_382.0) as i16);
@@ -370,7 +375,7 @@ fn velocity_component(mps: f64) -> cdd::VelocityComponent {
     }
 }
 
-/// A dimension; beyond the range the code that says so.
+/// A dimension; out of range, the corresponding code.
 fn dimension(metres: f64) -> cdd::ObjectDimension {
     let value = cdd::ObjectDimensionValue((metres * 10.0).round().clamp(1.0, 255.0) as u16);
     cdd::ObjectDimension {

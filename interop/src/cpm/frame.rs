@@ -21,22 +21,26 @@ const UNSTATED_AXIS: u16 = 4095;
 /// Code of an ellipse's direction that is unavailable.
 const NO_DIRECTION: u16 = 3601;
 
-/// Standard deviations in a semi-axis of an ellipse of 95 %: the root of the quantile of chi-squared with two degrees.
+/// Standard deviations in a semi-axis of an ellipse of 95 %: the root of the quantile of
+/// chi-squared with two degrees.
 const ELLIPSE_SIGMAS: f64 = 2.4477;
 
-/// Semi-axis in metres where the station states none: usual for satellite positioning without corrections.
+/// Semi-axis in metres if the station states none: usual for satellite positioning without
+/// corrections.
 const UNSTATED_AXIS_M: f64 = 5.0;
 
-/// A cell's frame and that of a message.
+/// A cell's frame and a message's frame.
 pub(super) struct MessageFrame {
     cell: GeographicOrigin,
     reference: GeographicOrigin,
-    /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from east.
+    /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from
+    /// east.
     rotation_rad: f64,
 }
 
 impl MessageFrame {
-    /// The frame of a message about a place in the cell's frame. Its reference position is one that a message can state.
+    /// The frame of a message at a place in the cell's frame. Its reference position is rounded to
+    /// a value that a message can state.
     pub(super) fn at(cell: &GeographicOrigin, x_m: f64, y_m: f64) -> Result<Self, CpmError> {
         let place = cell.to_wgs84(x_m, y_m, 0.0);
         Self::new(
@@ -78,7 +82,7 @@ impl MessageFrame {
     /// Covariance of a received reference position in the cell's frame.
     ///
     /// # Errors
-    /// [`CpmError::NoPosition`] for an error out of range.
+    /// Returns [`CpmError::NoPosition`] for an error out of range.
     pub(super) fn position_error(
         &self,
         ellipse: &cdd::PosConfidenceEllipse,
@@ -134,8 +138,8 @@ impl MessageFrame {
         })
     }
 
-    /// The reference position as a message states it. Its error is unavailable: a node does not know that of its origin or
-    /// pose.
+    /// The reference position in a message's form. Its error is unavailable, because a node has no
+    /// error estimate of its origin or pose.
     pub(super) fn reference_position(&self) -> cdd::ReferencePosition {
         let tenth_microdegrees = |degrees: f64| (degrees * 1e7).round() as i32;
         cdd::ReferencePosition {

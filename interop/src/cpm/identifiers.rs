@@ -7,20 +7,23 @@ use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::{NodeName, PART_MARK};
 use uuid::Uuid;
 
-/// Part of a node's name in which a foreign station's objects are reported, before the station's number.
+/// Part of a node's name in which a foreign station's objects are reported, before the station's
+/// number.
 pub const RECEIVED_PART: &str = "cpm-";
 
-/// True if a node's name is that of a part which reports the objects of received messages.
+/// True if a node's name belongs to a part that reports the objects of received messages.
 pub fn is_received(node: &NodeName) -> bool {
     node.as_str()
         .split_once(PART_MARK)
         .is_some_and(|(_, part)| part.starts_with(RECEIVED_PART))
 }
 
-/// Station numbers of the nodes of a cell. Each part of a node, such as its second camera, is a station of its own.
+/// Station numbers of the nodes of a cell. Each part of a node, such as its second camera, is a
+/// station of its own.
 ///
-/// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the namespace of URLs. It is the
-/// same in every run. Where two nodes collide, the later gets the next free number. A node that is silent for a minute has none.
+/// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the
+/// namespace of URLs. It is constant over all runs. If the numbers of two nodes collide, the later
+/// node gets the next free number. A node that is silent for a minute loses its number.
 #[derive(Debug)]
 pub struct StationIds {
     cell: NodeName,
@@ -50,8 +53,8 @@ impl StationIds {
         }
     }
 
-    /// The number of a node that is heard; `None` if its vehicle has [`MAX_PARTS`] other parts, or the cell 4096 other nodes, which
-    /// the log tells once.
+    /// The number of an active node; `None` if its vehicle has [`MAX_PARTS`] other parts, or the
+    /// cell 4096 other nodes, which is logged once.
     pub fn of(&mut self, node: &NodeName, now: Instant) -> Option<u32> {
         if let Some(known) = self.by_name.get_mut(node) {
             known.heard_at = now;
@@ -91,7 +94,7 @@ impl StationIds {
         Some(number)
     }
 
-    /// True if a node that was heard lately has the number.
+    /// True if a recently active node has the number.
     pub fn contains(&self, number: u32, now: Instant) -> bool {
         self.by_name
             .values()
@@ -110,8 +113,8 @@ pub struct ObjectIds {
 }
 
 impl ObjectIds {
-    /// Numbers of all objects of a map: the first two bytes of the UUID, or the next free number. Objects that are gone lose
-    /// theirs.
+    /// Numbers of all objects of a map: the first two bytes of the UUID, or the next free number.
+    /// Objects that have left the map lose their numbers.
     pub(super) fn assign(&mut self, objects: &[Uuid]) -> HashMap<Uuid, u16> {
         let present: HashSet<_> = objects.iter().collect();
         self.by_id.retain(|id, _| present.contains(id));

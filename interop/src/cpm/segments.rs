@@ -13,11 +13,12 @@ pub struct Segments {
 }
 
 impl Segments {
-    /// A whole message; `None` while segments of it are missing. Objects that a report omits would count as gone. A segment
-    /// of another time drops those before.
+    /// A whole message; `None` while segments of it are missing. Objects that a report omits would
+    /// count as gone. A segment of another time drops the previous segments.
     ///
     /// # Errors
-    /// [`CpmError::TooManyObjects`] if all segments together have more than a report may have; they are dropped.
+    /// Returns [`CpmError::TooManyObjects`] if all segments together have more than a report may
+    /// have; they are dropped.
     pub fn join(&mut self, received: ReceivedCpm) -> Result<Option<ReceivedCpm>, CpmError> {
         let Some((number, total)) = received.segment else {
             return Ok(Some(received));

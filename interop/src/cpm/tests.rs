@@ -169,7 +169,8 @@ proptest! {
             let place = left.iter().position(|other| is_it(other) && other.label == object.label);
             let other = left.swap_remove(place.expect("it is within a centimetre"));
             prop_assert!((other.confidence - object.confidence).abs() < 0.5 / 15.0 + 1e-9);
-            // The reference position's own error is unavailable; beyond 41 m only that much is known.
+            // The reference position's own error is unavailable; values above 41 m are only limited
+            // from below.
             let [xx, xy, yy] = other.covariance_m2.unwrap();
             let (own, wide) = ((5.0_f64 / 2.4477).powi(2), (40.95 / SIGMAS).powi(2));
             let variance = object.covariance_m2.map_or((10.0 / SIGMAS).powi(2), |[variance, ..]| variance).min(wide);

@@ -22,7 +22,7 @@ use crate::ros2::{
 /// A detector's camera.
 #[derive(Debug, Clone)]
 pub struct RosCamera {
-    /// Pose of a camera that stands, in the cell's frame; `None` if it is not known.
+    /// Pose of a standing camera in the cell's frame; `None` if it is not given.
     pub pose: Option<Pose>,
     /// Height and attitude of the camera.
     pub mount: Mount,
@@ -54,20 +54,20 @@ pub enum InputRefusal {
     /// Not a message of the topic's type.
     #[error("a message that cannot be decoded")]
     Malformed,
-    /// Positions relative to a camera whose pose at that time is not known.
+    /// Positions relative to a camera without a pose for that time.
     #[error(
         "a frame other than `map` without --pose of its camera, or a stamp far from those on --pose-topic"
     )]
     NoPose,
-    /// A pose of the camera that is none in the cell's frame.
+    /// A pose of the camera that is invalid in the cell's frame.
     #[error("a pose of the camera that is not in the frame `map`, or has no orientation")]
     BadPose,
-    /// A pose of the camera with the stamp of another time, or out of order.
+    /// A pose of the camera with a wrong stamp, or out of order.
     #[error(
         "a pose of the camera that is not later than the one before, or more than 10 s from this machine's time"
     )]
     BadPoseTime,
-    /// Boxes in pictures whose optics are not known yet.
+    /// Boxes in pictures before their optics have arrived.
     #[error("boxes before the first message on --camera-info")]
     NoOptics,
     /// Optics without size or focal lengths.
@@ -79,13 +79,13 @@ pub enum InputRefusal {
     /// An object without a class.
     #[error("an object without a hypothesis")]
     NoClass,
-    /// A hypothesis with a score that is no probability, as log-odds are.
+    /// A hypothesis with a score that is not a probability, such as log-odds.
     #[error("a score that is not within 0 to 1")]
     Score,
     /// A box that gives no position.
     #[error("a box that gives no position: {0}")]
     NoPosition(&'static str),
-    /// Values that no report may have.
+    /// Values that are not allowed in a report.
     #[error("values that no report may have")]
     Report,
 }
@@ -120,8 +120,8 @@ impl From<InputRefusal> for RefusedInput {
 type Placed = (Frame, Vec<RefusedInput>);
 
 impl RosCamera {
-    /// Places detections in space: in the frame `map`, in that of the camera, or in its optical one (REP 103).
-    /// A camera that moves is where `poses` have it.
+    /// Places detections in space: in the frame `map`, in the camera's frame, or in its optical
+    /// frame (REP 103). The pose of a moving camera is taken from `poses`.
     pub(super) fn place(
         &self,
         detections: &Detection3DArray,
@@ -166,7 +166,8 @@ impl RosCamera {
             .map(|result| &result.pose.covariance);
         let covariance_m2 = covariance.and_then(|covariance| to_map.covariance(covariance));
         let size = detection.bbox.size;
-        // An optical frame's boxes are not upright ones, and a box that is not turned may mean that nothing is known.
+        // The axes of an optical frame's boxes are not upright, and a box without rotation may have
+        // an unknown orientation.
         let has_size = !to_map.is_optical && size.x > 0.0 && size.y > 0.0;
         let turn = orientation
             .rotation()
@@ -212,7 +213,8 @@ impl RosCamera {
         )
     }
 
-    /// An object without a place: label and confidence of the best hypothesis, and those of all if there are several.
+    /// An object without a place: label and confidence of the best hypothesis, and the scores of
+    /// all if there are several.
     fn unplaced(
         &self,
         results: &[ObjectHypothesisWithPose],
@@ -299,7 +301,8 @@ pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), Re
     }
 }
 
-/// Places boxes in pictures of which the distortion has been removed, by the rules of [`RosCamera::place`].
+/// Places boxes in pictures of which the distortion has been removed, by the rules of
+/// [`RosCamera::place`].
 pub(super) fn place_in_pictures(
     camera: &RosCamera,
     detections: &Detection2DArray,
@@ -315,7 +318,7 @@ pub(super) fn place_in_pictures(
         let PerceivedObject { label, confidence, scores, .. } = camera.unplaced(&detection.results)?;
         let bounds = &detection.bbox;
         let (x, y) = (bounds.center.position.x, bounds.center.position.y);
-        // The upright box about one that is turned.
+        // The upright box around a rotated one.
         let (sin, cos) = bounds.center.theta.sin_cos();
         let half_width = ((bounds.size_x * cos).abs() + (bounds.size_y * sin).abs()) / 2.0;
         let half_height = ((bounds.size_x * sin).abs() + (bounds.size_y * cos).abs()) / 2.0;
@@ -380,7 +383,7 @@ impl CameraInfo {
     }
 }
 
-/// The way from a message's frame to the cell's.
+/// The conversion from a message's frame to the cell's.
 struct ToMap {
     origin: Pose,
     turn: Matrix3<f64>,
@@ -401,7 +404,7 @@ impl ToMap {
         turned.y.atan2(turned.x)
     }
 
-    /// `[xx, xy, yy]` in m²; `None` if nothing is stated: all zeros, or a negative variance.
+    /// `[xx, xy, yy]` in m²; `None` if it is not stated: all zeros, or a negative variance.
     fn covariance(&self, [x, y, z, ..]: &[[f64; 6]; 6]) -> Option<[f64; 3]> {
         let rows = [x, y, z].map(|[a, b, c, ..]| [*a, *b, *c]);
         let stated = Matrix3::from_fn(|row, column| {

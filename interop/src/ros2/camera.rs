@@ -31,8 +31,9 @@ pub(crate) struct RegionOfInterest {
     pub(crate) do_rectify: bool,
 }
 
-/// Optics of a camera. `d` are OpenCV's k1, k2, p1, p2, k3; `p` is for pictures without distortion. All are for the whole sensor, of
-/// which a picture is the region of interest, with one pixel for `binning_x` by `binning_y`; zeros mean the whole and one.
+/// Optics of a camera. `d` are OpenCV's k1, k2, p1, p2, k3; `p` is for pictures without distortion.
+/// All are for the whole sensor, of which a picture is the region of interest, with one pixel for
+/// `binning_x` by `binning_y`; zeros mean the whole and one.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct CameraInfo {
     pub(crate) header: Header,

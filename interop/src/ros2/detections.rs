@@ -9,11 +9,11 @@ use super::messages::{
 };
 use crate::object::CellObject;
 
-/// Extent of an object of which no size is known, and height of all, in metres.
+/// Extent of an object without a size, and height of all objects, in metres.
 const UNKNOWN_SIZE_M: f64 = 1.0;
 pub(super) const HEIGHT_M: f64 = 1.5;
 
-/// Variance of what is not known, as in `robot_localization`: large, and harmless to a filter.
+/// Variance of unavailable values, as in `robot_localization`: large, and harmless to a filter.
 const UNKNOWN_VARIANCE: f64 = 1e6;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -66,7 +66,8 @@ pub(super) fn size(object: &CellObject<'_>) -> RosVector {
     RosVector { x, y, z: HEIGHT_M }
 }
 
-/// A detection. Scores of classes are weighted by `existence`, the probability that there is an object at all.
+/// A detection. Scores of classes are weighted by `existence`, the probability that there is an
+/// object at all.
 fn detection(object: &CellObject<'_>, existence: f64, header: &Header, id: String) -> Detection3D {
     let mut covariance = [[0.0; 6]; 6];
     for (index, row) in covariance.iter_mut().enumerate() {
@@ -136,7 +137,7 @@ impl Detection3DArray {
                 .as_ref()
                 .map(ToString::to_string)
                 .unwrap_or_default();
-            // Of a detector, scores are confidences as they are.
+            // The scores of a detector are used as confidences without weighting.
             detection(&object.into(), 1.0, &header, id)
         });
         Self {

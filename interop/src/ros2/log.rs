@@ -26,7 +26,7 @@ pub enum ConversionError {
     /// It has no MCAP's first bytes.
     #[error("is no MCAP, as logs of nodes are")]
     NoLog,
-    /// Nothing was written.
+    /// The output would be empty.
     #[error("no map, report or picture of a node is there, {0} messages of other kinds")]
     Empty(u64),
     /// It cannot be read.
@@ -45,11 +45,11 @@ pub enum ConversionError {
 pub struct Conversion {
     /// Messages written.
     pub written: u64,
-    /// Messages of other channels, which have no form in ROS.
+    /// Messages of other channels, which have no equivalent in ROS.
     pub passed_over: u64,
-    /// Messages that are not as a node writes them.
+    /// Messages that differ from the form in which a node writes them.
     pub unusable: u64,
-    /// Logs that end before their last messages, as that of a killed node does, or are damaged.
+    /// Number of logs that end early, like the log of a killed node, or are damaged.
     pub cut: u64,
 }
 
@@ -89,7 +89,7 @@ impl<W: Write + Seek> RosLog<W> {
     /// Begins an MCAP.
     ///
     /// # Errors
-    /// [`ConversionError`] if the output cannot be written.
+    /// Returns a [`ConversionError`] if the output cannot be written.
     pub fn new(output: W) -> Result<Self, ConversionError> {
         let options = WriteOptions::new()
             .profile("ros2")
@@ -107,7 +107,7 @@ impl<W: Write + Seek> RosLog<W> {
     /// Writes the messages of a log.
     ///
     /// # Errors
-    /// [`ConversionError`] if this is no log, or the output cannot be written.
+    /// Returns a [`ConversionError`] if this is no log, or the output cannot be written.
     pub fn add(&mut self, mut log: impl Read) -> Result<(), ConversionError> {
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
@@ -183,7 +183,8 @@ impl<W: Write + Seek> RosLog<W> {
     /// Ends the MCAP.
     ///
     /// # Errors
-    /// [`ConversionError`] if it cannot be written, or no message of a node's log was found.
+    /// Returns a [`ConversionError`] if it cannot be written, or no message of a node's log was
+    /// found.
     pub fn finish(mut self) -> Result<Conversion, ConversionError> {
         self.output.writer.finish()?;
         if self.done.written == 0 {
@@ -283,7 +284,8 @@ impl<W: Write + Seek> TimedOutput<'_, W> {
         Ok(true)
     }
 
-    /// The header of a picture in the frame of a log, which earlier versions named by the node alone.
+    /// The header of a picture in the frame of a log, which earlier versions named by the node
+    /// alone.
     fn header(&self, frame: &str) -> Option<Header> {
         let node = NodeName::new(frame.strip_suffix("/optical").unwrap_or(frame)).ok()?;
         let stamp = RosTime::of(Timestamp(self.at.publish / 1000));
@@ -294,7 +296,7 @@ impl<W: Write + Seek> TimedOutput<'_, W> {
     }
 }
 
-/// The topic of the only camera, or of one with a name.
+/// The topic of the only camera, or of a named camera.
 fn camera_topic(camera: &str, kind: &str) -> String {
     match NodeName::new(camera) {
         Ok(name) => format!("/ecod/camera/{}/{kind}", ros_name(&name)),

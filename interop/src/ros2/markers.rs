@@ -59,7 +59,7 @@ pub(super) struct MarkerArray {
 }
 
 impl MarkerArray {
-    /// Boxes and labels of all objects, in place of those before; opaque are those that are certain.
+    /// Boxes and labels of all objects, replacing the previous ones; certain objects are opaque.
     pub(super) fn of_map(map: &GlobalMap) -> Self {
         let none = RosPose {
             position: RosVector::default(),

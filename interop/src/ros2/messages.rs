@@ -10,14 +10,14 @@ pub(crate) trait RosMessage {
     const NAME: &'static str;
 }
 
-/// A message with a name and a definition by which others read it.
+/// A message with a name and a definition, with which other programs can read it.
 pub(crate) trait Definition: RosMessage {
     /// Its own fields.
     const FIELDS: &'static str;
     /// The messages inside it.
     const INSIDE: &'static [(&'static str, &'static str)];
 
-    /// The definition as MCAP has it: the fields, and those of each message inside.
+    /// The definition in MCAP's form: the fields, followed by the definitions of nested messages.
     fn definition() -> String {
         let rule = "=".repeat(80);
         let inside = Self::INSIDE
@@ -81,7 +81,7 @@ pub(crate) struct Header {
 }
 
 impl Header {
-    /// The time of the stamp, or now for one that nobody set; `None` before 1970.
+    /// The time of the stamp, or the current time for an unset stamp; `None` before 1970.
     #[cfg(feature = "dds")]
     pub(crate) fn time(&self) -> Option<Timestamp> {
         let micros = self.stamp.micros()?;
@@ -116,7 +116,7 @@ pub(crate) struct RosQuaternion {
 }
 
 impl RosQuaternion {
-    /// The rotation; `None` if it is none, as when all is zero.
+    /// The rotation; `None` if it is invalid, for example all zeros.
     #[cfg(feature = "dds")]
     pub(crate) fn rotation(&self) -> Option<UnitQuaternion<f64>> {
         UnitQuaternion::try_new(

@@ -7,7 +7,8 @@ use rumqttc::{
     TlsConfiguration, Transport,
 };
 
-/// A broker, and what it and the cell behind it ask of clients: TLS, a user's name and password, signed payloads.
+/// A broker, and the access data that it and its cell require from clients: TLS, user name and
+/// password, signed payloads.
 #[derive(Debug, Clone)]
 pub struct BrokerAccess {
     /// Where it is.
@@ -16,10 +17,10 @@ pub struct BrokerAccess {
     pub(super) security: Security,
 }
 
-/// Why simulated vehicles do not get in.
+/// The reason why simulated vehicles are not admitted.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    /// A certificate of the cell speaks for one vehicle.
+    /// A certificate of the cell is valid for one vehicle.
     #[error(
         "the broker at {0} is embedded in a cell with certificates, where each speaks for one vehicle only: no program can \
          be many of them. Measure without --config and --connect a cell of this machine's own, or the cell through an \
@@ -32,7 +33,7 @@ pub enum AccessError {
 }
 
 impl BrokerAccess {
-    /// To a broker that asks for nothing.
+    /// Access to a broker without requirements.
     pub fn open(broker: BrokerAddress) -> Self {
         Self {
             broker,
@@ -41,10 +42,11 @@ impl BrokerAccess {
         }
     }
 
-    /// As a node with this configuration; the files that it names are read.
+    /// Access as a node with this configuration; the files that it names are read.
     ///
     /// # Errors
-    /// [`AccessError`] when the broker is one of the cell's own with certificates, or a file cannot be used.
+    /// Returns an [`AccessError`] if the broker is one of the cell's own with certificates, or a
+    /// file cannot be used.
     pub fn of(broker: BrokerAddress, config: &NodeConfig) -> Result<Self, AccessError> {
         if config.tls.is_some() && config.mqtt.broker.as_ref() != Some(&broker) {
             return Err(AccessError::Closed(broker));
@@ -66,12 +68,12 @@ impl BrokerAccess {
         })
     }
 
-    /// The payload as it travels on a topic.
+    /// The payload in the form that is sent on a topic.
     pub(super) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         self.security.seal(topic, payload)
     }
 
-    /// The payload of what came; who sealed it is not asked.
+    /// The payload of a received message; its signature is not verified.
     pub(super) fn unseal<'a>(&self, received: &'a [u8]) -> &'a [u8] {
         received
             .get(self.security.envelope_bytes()..)

@@ -1,4 +1,4 @@
-//! An aggregator of the benchmark's own: a node in a process of its own, with its broker, on loopback.
+//! An aggregator started by the benchmark: a node in its own process, with its broker, on loopback.
 
 use std::fs;
 use std::net::SocketAddr;
@@ -20,7 +20,8 @@ use crate::node_process::{NodeProcess, free_address};
 /// All vehicles of the largest load vote.
 const MAX_VOTERS: usize = 1000;
 
-/// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its files.
+/// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its
+/// files.
 #[derive(Debug)]
 pub struct OwnAggregator {
     process: NodeProcess,
@@ -30,10 +31,11 @@ pub struct OwnAggregator {
 }
 
 impl OwnAggregator {
-    /// Starts `program` as an edge with a dashboard, recording if `records`, and waits until its broker serves.
+    /// Starts `program` as an edge with a dashboard, recording if `records`, and waits until its
+    /// broker serves.
     ///
     /// # Errors
-    /// When it cannot be started or ends.
+    /// Returns an error if it cannot be started or ends.
     pub async fn start(program: &Path, records: bool) -> anyhow::Result<Self> {
         let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
         fs::create_dir_all(&directory)
@@ -76,7 +78,7 @@ impl OwnAggregator {
     /// Target of the measurement.
     ///
     /// # Errors
-    /// When the process has ended.
+    /// Returns an error if the process has ended.
     pub fn target(&mut self) -> anyhow::Result<&Target> {
         self.process.check()?;
         Ok(&self.target)

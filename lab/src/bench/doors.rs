@@ -1,5 +1,5 @@
-//! Figures of a door: how much later than its node a program has a map, how soon its reports are in the map, and what
-//! the door costs.
+//! Figures of a node's local broker: the delay of maps for programs compared to the node, the
+//! latency of programs' reports, and the cost of the broker.
 //!
 //! ```text
 //! edge ── map ──> vehicle: its map log ──> door ── map ──> program
@@ -7,8 +7,8 @@
 //! another ── report ───────────> edge's broker ──> edge ── map ──> the same watcher
 //! ```
 //!
-//! Edge and vehicle are processes of their own on loopback. Reports of the two ways take turns: only one of them has
-//! anything to wait for in a round.
+//! Edge and vehicle are separate processes on loopback. Reports of the two paths take turns, so
+//! that a round only waits for one of them.
 
 use std::collections::HashMap;
 use std::fs;
@@ -38,25 +38,25 @@ use super::two_hop;
 use super::usage::UsageMeter;
 use crate::node_process::NodeProcess;
 
-/// Everything that is measured at a door.
+/// All figures of a local broker.
 #[derive(Debug, Clone, Serialize)]
 pub struct DoorFigures {
     /// From a map's arrival at the node to its arrival at a program.
     pub behind_node: Quantiles,
-    /// From a report at the door of a node that follows to its map at a program of the leader.
+    /// From a report at the local broker of a following node to its map at a program of the leader.
     pub report_at_door: Quantiles,
-    /// From a report at the leader's broker to the same.
+    /// From a report at the leader's broker to its map at the same program.
     pub report_at_leader: Quantiles,
-    /// One hop through the door's broker, median in microseconds.
+    /// One hop through the local broker, median in microseconds.
     pub hop_us: f64,
-    /// Resident memory of the idle vehicle with a door, in megabytes.
+    /// Resident memory of the idle vehicle with a local broker, in megabytes.
     pub resident_mb: f64,
-    /// Part of it that is not there without a door.
+    /// Part of this memory that is due to the local broker.
     pub door_mb: f64,
 }
 
 impl DoorFigures {
-    /// Names, figures and what they may be at most.
+    /// Names, figures and their maximum values.
     pub fn goals(&self) -> [(&'static str, f64, f64); 4] {
         let later_us = self.report_at_door.p50_us - self.report_at_leader.p50_us;
         let missing_percent = self
@@ -86,7 +86,8 @@ const PERIOD: Duration = Duration::from_millis(100);
 /// Turns of each way.
 const TURNS: u32 = 2;
 
-/// Time at the begin of a turn that is not counted: the maps forget the other way's reports.
+/// Time at the beginning of a turn that is not counted, until the maps have dropped the other
+/// path's reports.
 const WARM_UP: Duration = Duration::from_secs(4);
 
 /// Idle vehicles of each kind whose memory is read, and the time that each gets to settle.
@@ -100,7 +101,7 @@ const LAST_MAP: Duration = Duration::from_secs(1);
 /// Starts an edge and a vehicle, and measures each way for so long.
 ///
 /// # Errors
-/// When a node cannot be started or ends, or no map comes.
+/// Returns an error if a node cannot be started or ends, or no map comes.
 pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorFigures> {
     let directory = std::env::temp_dir().join(format!("ecod-doors-{}", std::process::id()));
     fs::create_dir_all(&directory)
@@ -178,7 +179,7 @@ fn configuration(name: &'static str, role: Role) -> NodeConfig {
 
 const CELL: &str = "bench";
 
-/// Topic on which nobody publishes: a login is over when its subscription is.
+/// Topic without publishers: a login is complete when its subscription is.
 const QUIET: &str = "ecod/bench/quiet";
 
 /// Address of a node's broker.
@@ -188,7 +189,8 @@ async fn serves(node: &mut NodeProcess) -> anyhow::Result<SocketAddr> {
         .context("no broker listens by the node's log, or RUST_LOG hides it")?
 }
 
-/// Memory of an idle vehicle with a door, and the part of it that is the door's, in megabytes: medians.
+/// Memory of an idle vehicle with a local broker, and the broker's part of it, in megabytes:
+/// medians.
 async fn idle_memory(
     program: &Path,
     vehicle: &NodeConfig,
@@ -299,7 +301,8 @@ fn topics() -> Topics {
     Topics::new(&NodeName::from_static(CELL))
 }
 
-/// Reports at a broker in a name for so long; the times until the watcher has the maps that rest on the reports.
+/// Reports to a broker under a name for a time; returns the times until the watcher has the maps
+/// that include the reports.
 async fn report(
     broker: SocketAddr,
     name: &str,
@@ -354,9 +357,9 @@ async fn report(
     Ok(latencies)
 }
 
-/// Times by which the program at the door has each map later than its node.
+/// Delays of each map at the local program compared to its node.
 fn behind_node(map_log: &Path, at_door: &DoorWatcher) -> anyhow::Result<Latencies> {
-    // Before the log: the node writes a map there before its door passes it on.
+    // Before the log: the node writes a map there before its local broker forwards it.
     let at_door = at_door.maps();
     let text = fs::read_to_string(map_log)
         .with_context(|| format!("cannot read {}", map_log.display()))?;
@@ -382,8 +385,8 @@ fn behind_node(map_log: &Path, at_door: &DoorWatcher) -> anyhow::Result<Latencie
     )
 }
 
-/// These microseconds as times, unless too many of them are negative: the cell's time, by which the log is dated, is ahead
-/// of this machine's clock then.
+/// These microseconds as times. Fails if too many of them are negative, because the cell's time, by
+/// which the log is dated, is then ahead of this machine's clock.
 fn delays(micros: &[i64]) -> anyhow::Result<Latencies> {
     let early = micros.iter().filter(|delay| **delay < 0).count();
     ensure!(

@@ -1,4 +1,4 @@
-//! The thread that sends: it waits for the schedule and for nothing else.
+//! The thread that sends the reports; it only waits for the schedule.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -38,7 +38,8 @@ pub(super) fn drive(
     target: &Target,
     mut senders: Vec<Sender>,
 ) -> Sent {
-    // Without it Linux lets a thread sleep 50 µs longer than asked; a kernel that refuses only costs that.
+    // Otherwise Linux lets a thread sleep 50 µs longer than requested. If the kernel refuses,
+    // sleeps are only less exact.
     if let Err(error) = nix::sys::prctl::set_timerslack(1) {
         tracing::debug!(%error, "timer slack stays");
     }

@@ -1,4 +1,4 @@
-//! The bare way's counterpart of the aggregator.
+//! The counterpart of the aggregator on the bare path.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -31,16 +31,17 @@ impl AnswerBytes {
     }
 }
 
-/// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator
-/// has, and ends when dropped.
+/// Answers once all vehicles have sent, with a map's and a verdict's bytes; runs on its own thread,
+/// like the aggregator, and ends when dropped.
 #[derive(Debug)]
 pub(super) struct Echo {
     _stop: oneshot::Sender<()>,
 }
 
 impl Echo {
-    /// Starts it; it is subscribed when this returns. A tick is complete with `packets`, and its answers have as many bytes as
-    /// `answer_bytes` says when they are sent; without verdicts there is one.
+    /// Starts the echo; it is subscribed when this returns. A tick is complete after `packets`
+    /// packets. Its answers have the current sizes in `answer_bytes`; without verdicts there is one
+    /// answer.
     pub(super) async fn start(
         access: BrokerAccess,
         packets: usize,
@@ -59,7 +60,7 @@ impl Echo {
                 Ok(connected) => connected,
                 Err(error) => return ready.send(Err(error)).unwrap_or_default(),
             };
-            // Whoever started it may have given up.
+            // The caller may have given up.
             ready.send(Ok(())).unwrap_or_default();
             let mut arrived = BTreeMap::<u32, usize>::new();
             while let Ok(event) = events.poll().await {
@@ -72,7 +73,7 @@ impl Echo {
                 let count = arrived.entry(tick).or_default();
                 *count += 1;
                 if *count == packets {
-                    // Those of before that are incomplete lost packets.
+                    // Earlier ticks that are incomplete have lost packets.
                     arrived.retain(|earlier, _| *earlier > tick);
                     for bytes in answer_bytes.all().into_iter().take(1 + usize::from(votes)) {
                         let answer = stamped(tick, vec![0; bytes]);

@@ -10,9 +10,9 @@ use super::two_hop::latencies;
 /// Answers of a cell with their latencies.
 #[derive(Debug, Clone)]
 pub struct Latencies {
-    /// Nanoseconds. What never came back counts with the time for which it was waited.
+    /// Nanoseconds. A missing answer counts with the time for which it was waited for.
     pub histogram: Histogram<u64>,
-    /// Answers that never came.
+    /// Number of missing answers.
     pub missing: u64,
 }
 
@@ -21,7 +21,7 @@ pub struct Latencies {
 pub struct Answers {
     /// As maps.
     pub map: Latencies,
-    /// As verdicts; empty where nobody votes.
+    /// Latencies as verdicts; empty in a cell without votes.
     pub verdict: Latencies,
 }
 
@@ -36,12 +36,12 @@ pub struct Quantiles {
     pub p999_us: f64,
     /// Number of answers.
     pub n: u64,
-    /// Number of answers that never came.
+    /// Number of missing answers.
     pub missing: u64,
 }
 
 impl Quantiles {
-    /// Share of the answers that never came, in percent.
+    /// Share of missing answers, in percent.
     pub fn missing_percent(&self) -> f64 {
         100.0 * self.missing as f64 / self.n.max(1) as f64
     }
@@ -57,20 +57,20 @@ impl Default for Latencies {
 }
 
 impl Latencies {
-    /// Takes those of another run in.
+    /// Adds the answers of another run.
     pub fn add(&mut self, other: &Self) {
         // Both have the same bounds.
         self.histogram.add(&other.histogram).unwrap_or_default();
         self.missing += other.missing;
     }
 
-    /// Takes in one answer that was due, or the time for which it was waited.
+    /// Adds one answer that was due, or the time for which it was waited for.
     pub(super) fn take(&mut self, due: Instant, arrival: Option<Instant>, waited_until: Instant) {
         let taken = |end: Instant| end.saturating_duration_since(due);
         self.take_time(arrival.map(taken), taken(waited_until));
     }
 
-    /// Takes in the time of one answer, or the time for which it was waited.
+    /// Adds the time of one answer, or the time for which it was waited for.
     pub(super) fn take_time(&mut self, taken: Option<Duration>, waited: Duration) {
         self.missing += u64::from(taken.is_none());
         let nanos = taken.unwrap_or(waited).as_nanos();
@@ -92,7 +92,7 @@ impl Latencies {
 }
 
 impl Answers {
-    /// Takes those of another run in.
+    /// Adds the answers of another run.
     pub fn add(&mut self, other: &Self) {
         self.map.add(&other.map);
         self.verdict.add(&other.verdict);

@@ -14,18 +14,19 @@ pub struct Load {
     pub vehicles: usize,
     /// Time from one report of a vehicle to its next.
     pub period: Duration,
-    /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a period.
+    /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a
+    /// period.
     pub spread: Duration,
     /// Time for which reports are sent; the first tenth warms up and is not counted.
     pub duration: Duration,
     /// True to measure the bare way too.
     pub bare: bool,
-    /// True to let vehicles vote too, with a second report before that for the map.
+    /// Whether vehicles also vote, with a second report before the one for the map.
     pub votes: bool,
 }
 
 impl Load {
-    /// Reports and votes of this many vehicles ten times a second, all at once, beside the bare way.
+    /// Reports and votes of this many vehicles ten times a second, all at once, and the bare path.
     pub fn new(vehicles: usize, duration: Duration) -> Self {
         Self {
             vehicles,
@@ -60,8 +61,8 @@ pub fn landmarks() -> Vec<LandmarkConfig> {
         .collect()
 }
 
-/// Report of one vehicle on ten neighbouring locations: an object at each, and that all were in view. In a cell that
-/// has no locations, objects stand where [`landmarks`] are.
+/// Report of one vehicle on ten neighbouring locations: an object at each, all in view. In a cell
+/// without locations, the objects are at the places of [`landmarks`].
 pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
     let spots = spots(vehicle, landmarks);
     let object = |spot: &LandmarkConfig| PerceivedObject {
@@ -75,7 +76,7 @@ pub(super) fn report(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectRepo
     }
 }
 
-/// The same as votes.
+/// The report in the form of votes.
 pub(super) fn vote(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport {
     let mut vote = report(vehicle, landmarks);
     for (object, spot) in vote.objects.iter_mut().zip(spots(vehicle, landmarks)) {
@@ -101,7 +102,7 @@ fn spots(vehicle: usize, known: &[LandmarkConfig]) -> Vec<LandmarkConfig> {
 /// The vehicle's name.
 ///
 /// # Panics
-/// Never: a number makes a name.
+/// Does not panic: a number is a valid name.
 #[expect(clippy::expect_used, reason = "letters, a dash and digits are a name")]
 fn name(vehicle: usize) -> NodeName {
     NodeName::new(format!("cav-{vehicle}")).expect("a number makes a name")

@@ -20,10 +20,10 @@ use super::vehicle::{BenchVehicle, Came, Common};
 /// Result of a load.
 #[derive(Debug, Clone)]
 pub struct BenchFigure {
-    /// From when a round's last report was due to the map that rests on the reports of all, and to the verdicts of that
-    /// round, at every vehicle.
+    /// From the due time of a round's last report to the map that includes all reports, and to the
+    /// verdicts of that round, at every vehicle.
     pub cell: Answers,
-    /// The same by the bare way; empty if it was not asked for.
+    /// The same latencies on the bare path; empty if it was not requested.
     pub bare: Answers,
     /// Bytes of a report.
     pub report_bytes: usize,
@@ -51,7 +51,7 @@ const LEAD_IN: Duration = Duration::from_millis(300);
 /// Connects the vehicles, sends the load and gathers the answers.
 ///
 /// # Errors
-/// When the broker cannot be reached or no map comes.
+/// Returns an error if the broker cannot be reached or no map comes.
 pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure> {
     let load = Load {
         votes: load.votes && target.votes,

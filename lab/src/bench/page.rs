@@ -13,7 +13,8 @@ use tokio::net::TcpStream;
 pub struct PageFigures {
     /// Bytes of all its files as they are sent, uncompressed.
     pub bytes: usize,
-    /// From the first request to the first picture of the cell, the files one after another, without drawing.
+    /// From the first request to the first picture of the cell, the files one after another,
+    /// without drawing.
     pub first_picture: Duration,
 }
 
@@ -23,10 +24,10 @@ const EVENT_END: &[u8] = b"\n\n";
 /// Time that any part may take.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Asks for all that a browser asks for until it has something to draw.
+/// Requests all files that a browser requests until it can draw a picture.
 ///
 /// # Errors
-/// When the page is not there or sends no picture.
+/// Returns an error if the page is unreachable or sends no picture.
 pub async fn fetch(page: SocketAddr) -> anyhow::Result<PageFigures> {
     let begun = Instant::now();
     let mut bytes = 0;

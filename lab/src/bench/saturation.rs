@@ -1,4 +1,4 @@
-//! Search for the number of vehicles that a cell carries.
+//! Search for the number of vehicles that a cell can serve.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use super::load::Load;
 use super::measurement::{BenchFigure, measure};
 use super::target::Target;
 
-/// A load is carried while 99 of 100 answers take less, and none is missing.
+/// The cell can serve a load if 99 of 100 answers take less than this, and all answers arrive.
 pub const LIMIT: Duration = Duration::from_millis(100);
 
 /// One load of the search.
@@ -21,11 +21,11 @@ pub struct Step {
     pub carried: bool,
     /// From a round's last report to its map, at every vehicle.
     pub map: Quantiles,
-    /// From a round's last report to its verdicts; none where the cell makes none.
+    /// From a round's last report to its verdicts; `None` in a cell without verdicts.
     pub verdict: Option<Quantiles>,
     /// Bytes of the map, which goes to every vehicle.
     pub map_bytes: usize,
-    /// Bytes of the verdicts, which do too.
+    /// Bytes of the verdicts, which also go to every vehicle.
     pub verdict_bytes: usize,
     /// Reports that this process could not send.
     pub refused: u64,
@@ -56,19 +56,22 @@ pub struct AggregatorShares {
 /// Result of a search.
 #[derive(Debug, Clone, Serialize)]
 pub struct Saturation {
-    /// The most vehicles that were carried; none if not even the first load was.
+    /// The largest number of vehicles that the cell could serve; `None` if even the first load was
+    /// too high.
     pub most_vehicles: Option<usize>,
-    /// Bottleneck at the least load that was not carried, in words; none if all were carried.
+    /// Bottleneck at the lowest load that was too high, as text; `None` if the cell could serve all
+    /// loads.
     pub first_saturated: Option<String>,
-    /// All loads, as they were tried; of two tries the second.
+    /// All loads in the order of their tries; if a load was tried twice, the second try.
     pub steps: Vec<Step>,
 }
 
-/// Doubles the load from `least` to `most` until it is not carried any more, then halves the distance to the last that
-/// was, down to an eighth. What is not carried is tried twice, the second time counts: a machine hiccups.
+/// Doubles the load from `least` to `most` until the cell cannot serve it any more, then halves the
+/// distance to the last load that it could serve, down to an eighth. A failed load is tried again,
+/// and the second try counts, because the machine may have hiccups.
 ///
 /// # Errors
-/// As [`measure`], and what `tell` returns.
+/// Returns the errors of [`measure`] and of `tell`.
 pub async fn search(
     target: &Target,
     [least, most]: [usize; 2],
@@ -139,7 +142,7 @@ impl Step {
         }
     }
 
-    /// Bottleneck: the load itself, if it did not go out as it should, and then a processor.
+    /// Bottleneck: the load itself, if it was not sent as scheduled, otherwise a processor.
     fn blame(&self) -> String {
         let Self {
             refused,
@@ -174,7 +177,8 @@ impl Shares {
         }
     }
 
-    /// Exhausted processor: a single thread with a core of its own, or all cores, and who takes most of them.
+    /// Exhausted processor: a single thread that uses a whole core, or all cores, and the process
+    /// that uses most of them.
     fn busiest(self) -> String {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let all_cores = BUSY_PERCENT * cores as f64;
@@ -217,10 +221,11 @@ impl Shares {
 
 const BROKER_THREAD: &str = "mqtt-broker";
 
-/// From here on a core counts as used up: the scheduler and the kernel's own work on packets take the rest.
+/// From here on a core counts as used up: the scheduler and the kernel's own work on packets take
+/// the rest.
 const BUSY_PERCENT: f64 = 80.0;
 
-/// From here on it is the sender that a load was too much for.
+/// Lateness of sending in milliseconds from which the sender itself is overloaded.
 const MAX_LATE_MS: f64 = 10.0;
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
 
-/// Ticks of equal length; fixed before the first, whatever becomes of the load.
+/// Ticks of equal length, fixed before the first one, independent of the load.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Schedule {
     start: Instant,
@@ -38,7 +38,8 @@ impl Schedule {
         self.start_at + self.period * tick
     }
 
-    /// The tick whose reports were captured then, as far as an estimated clock tells; `None` before the first.
+    /// The tick whose reports were captured at that time, within the error of an estimated clock;
+    /// `None` before the first.
     pub(super) fn tick_captured_at(&self, captured: Timestamp) -> Option<u32> {
         let half = self.period / 2;
         let since = (captured + half).micros_from(self.start_at);

@@ -13,12 +13,12 @@ pub struct Target {
     pub access: BrokerAccess,
     /// Its name.
     pub cell: NodeName,
-    /// Its known locations.
+    /// The cell's landmarks.
     pub landmarks: Vec<LandmarkConfig>,
     /// Encoding of reports.
     pub encoding: Encoding,
     /// True if its rounds make verdicts.
     pub votes: bool,
-    /// The aggregator's process, if it is on this machine and to be watched.
+    /// The aggregator's process, if it is on this machine and should be watched.
     pub aggregator: Option<u32>,
 }

@@ -1,5 +1,5 @@
-//! The time over two hops of one broker: publish, subscriber, publish, subscriber. The least that a report needs to
-//! come back as a map.
+//! The time over two hops of one broker: publish, subscriber, publish, subscriber. This is the
+//! minimum time for a report to come back as a map.
 
 use std::time::Duration;
 
@@ -14,9 +14,10 @@ use super::access::BrokerAccess;
 /// Messages that are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TwoHopLoad {
-    /// Number of messages; those of the first tenth warm up and are not counted.
+    /// Number of messages; the first tenth is for warming up and is not counted.
     pub messages: u32,
-    /// Time from one message to the next, whatever became of the last: a slow broker does not slow the load down.
+    /// Time from one message to the next, independent of answers: a slow broker does not reduce the
+    /// load.
     pub interval: Duration,
     /// Bytes of every payload, at least 4.
     pub payload_bytes: usize,
@@ -33,7 +34,7 @@ impl Default for TwoHopLoad {
     }
 }
 
-/// Why there is no result.
+/// The reason why there is no result.
 #[derive(Debug, thiserror::Error)]
 pub enum TwoHopError {
     /// A connection could not be made or broke.
@@ -60,11 +61,11 @@ const OUT: &str = "ecod/bench/out";
 const BACK: &str = "ecod/bench/back";
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its client to when it
-/// was back.
+/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its
+/// client to when it was back.
 ///
 /// # Errors
-/// [`TwoHopError`] when the broker cannot be reached or loses messages.
+/// Returns a [`TwoHopError`] if the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection {
         broker: broker.clone(),
@@ -96,7 +97,8 @@ pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u
         ticks.tick().await;
         let mut payload = vec![0; load.payload_bytes.max(4)];
         payload[..4].copy_from_slice(&index.to_le_bytes());
-        // Not when the tick was due: the timer's millisecond is not the broker's, and publishing never waits.
+        // Measured from here and not from the tick's due time: the timer's millisecond is not due
+        // to the broker, and publishing does not block.
         sent.push(Instant::now());
         // A refusal shows as a missing message.
         sender
@@ -134,7 +136,7 @@ pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u
 /// An empty histogram of nanoseconds up to a minute, three digits.
 ///
 /// # Panics
-/// Never: the bounds are allowed.
+/// Does not panic: the bounds are allowed.
 #[expect(clippy::expect_used, reason = "the bounds are constant and allowed")]
 pub fn latencies() -> Histogram<u64> {
     Histogram::new_with_bounds(1, 60_000_000_000, 3).expect("the bounds are allowed")

@@ -19,7 +19,7 @@ pub struct Usage {
     pub threads: BTreeMap<String, f64>,
     /// Resident memory at the end, in bytes.
     pub resident_bytes: u64,
-    /// Of these, what no file holds: heap and stacks, not code and libraries.
+    /// Resident memory that is not backed by files: heap and stacks, not code and libraries.
     pub anonymous_bytes: u64,
 }
 
@@ -67,7 +67,7 @@ impl Usage {
     }
 }
 
-/// Names and processor times of the threads; none when the process is gone.
+/// Names and processor times of the threads; empty if the process has ended.
 fn threads(pid: u32) -> BTreeMap<u32, (String, Duration)> {
     let Ok(tasks) = fs::read_dir(format!("/proc/{pid}/task")) else {
         return BTreeMap::new();

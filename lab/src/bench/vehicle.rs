@@ -1,4 +1,4 @@
-//! A simulated vehicle: one MQTT connection, and when answers came over it.
+//! A simulated vehicle: one MQTT connection, and the arrival times of answers.
 
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -26,7 +26,7 @@ pub(super) struct Common {
     pub(super) has_map: watch::Sender<bool>,
 }
 
-/// When the answers to each tick came by one way; `None` until they do.
+/// Arrival times of the answers to each tick on one path; `None` until they arrive.
 #[derive(Debug)]
 pub(super) struct Came {
     pub(super) map: Vec<Option<Instant>>,
@@ -42,7 +42,7 @@ impl Came {
     }
 }
 
-/// When answers came through the cell and the bare way.
+/// Arrival times of answers through the cell and on the bare path.
 #[derive(Debug)]
 pub(super) struct Arrivals {
     pub(super) cell: Came,
@@ -147,7 +147,8 @@ impl Arrivals {
         }
     }
 
-    /// A map came that rests on no report of before `tick`: it answers that and all before.
+    /// Processes a map that includes no report from before `tick`: it answers that tick and all
+    /// earlier ones.
     fn map(&mut self, round: u64, tick: u32, at: Instant) {
         let [open, _] = &mut self.open;
         while *open <= tick as usize
@@ -159,8 +160,9 @@ impl Arrivals {
         }
     }
 
-    /// Verdicts came: if not of an earlier round than the last map that answered, they answer what it did. They leave
-    /// the aggregator after the map of their round, by the same way.
+    /// Processes verdicts: if their round is not before the round of the last answering map, they
+    /// answer the same ticks. The aggregator sends them after the map of their round, on the same
+    /// path.
     fn verdict(&mut self, round: u64, at: Instant) {
         let [answered, open] = &mut self.open;
         if round >= self.answered_in && *open < *answered {
@@ -171,7 +173,8 @@ impl Arrivals {
         }
     }
 
-    /// An answer of the bare way came; the first to a tick stands for the map, the second for the verdicts.
+    /// Processes an answer on the bare path; the first to a tick stands for the map, the second for
+    /// the verdicts.
     fn echo(&mut self, tick: u32, at: Instant) {
         let Came { map, verdict } = &mut self.bare;
         if let (Some(map), Some(verdict)) =
@@ -182,11 +185,11 @@ impl Arrivals {
     }
 }
 
-/// Fields of a map that tell its round.
+/// Fields of a map that determine its round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct MapHead {
     round: u64,
-    /// Capture time of the oldest report that it rests on.
+    /// Capture time of the oldest report in it.
     oldest_capture: Option<Timestamp>,
 }
 

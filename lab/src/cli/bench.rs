@@ -1,4 +1,4 @@
-//! `ecod-lab bench`: how fast a live cell is, how much it carries and what it costs.
+//! `ecod-lab bench`: latency, capacity and costs of a live cell.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -37,10 +37,12 @@ pub(super) struct BenchArguments {
     /// Seconds for which each number of vehicles is measured
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
-    /// Milliseconds over which the vehicles of a round spread their reports; 0 has them report at once
+    /// Milliseconds over which the vehicles of a round spread their reports; with 0 they report at
+    /// once
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..50))]
     spread_ms: u64,
-    /// Broker of a running cell to be measured; without it the program starts an aggregator of its own on loopback
+    /// Broker of a running cell to be measured; without it the program starts its own aggregator on
+    /// loopback
     #[arg(long, value_name = "HOST:PORT")]
     connect: Option<BrokerAddress>,
     /// Configuration of a node of the running cell: its broker, its name, its locations
@@ -49,19 +51,22 @@ pub(super) struct BenchArguments {
     /// Name of the running cell
     #[arg(long)]
     cell: Option<NodeName>,
-    /// Do not look for the highest load at which 99 of 100 reports are answered within 100 ms
+    /// Skip the search for the highest load at which 99 of 100 reports are answered within 100 ms
     #[arg(long)]
     no_saturate: bool,
     /// Most vehicles of that search
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u16).range(4..=1000))]
     up_to: u16,
-    /// Measure instead what an aggregator of its own costs with 32 vehicles: memory, processor time, recording
+    /// Measure instead the costs of an own aggregator with 32 vehicles: memory, processor time,
+    /// recording
     #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to"])]
     costs: bool,
-    /// Measure instead the door of a vehicle beside the vehicle itself and the leader's broker; fails if a goal is missed
+    /// Measure instead the local broker of a vehicle, compared to the vehicle itself and the
+    /// leader's broker; fails if a goal is missed
     #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to", "costs"])]
     doors: bool,
-    /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other sections stay
+    /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other
+    /// sections stay
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
@@ -80,7 +85,7 @@ struct Figures {
     saturation: Option<Saturation>,
 }
 
-/// A cell beside the bare way.
+/// Figures of a cell and of the bare path.
 #[derive(Debug, Serialize)]
 struct Comparison {
     map: Ways,
@@ -93,7 +98,7 @@ struct Comparison {
     sent_late_us: u128,
 }
 
-/// One kind of answer by both ways.
+/// One kind of answer on both paths.
 #[derive(Debug, Serialize)]
 struct Ways {
     cell: Quantiles,
@@ -110,16 +115,16 @@ struct Goal {
     met: bool,
 }
 
-/// Maximum ratio of the cell's latency to that of the bare way.
+/// Maximum ratio of the cell's latency to the latency of the bare path.
 const MAX_RATIO: f64 = 1.5;
 
-/// Rounds of a measurement, between which vehicles connect anew.
+/// Rounds of a measurement, between which vehicles reconnect.
 const PASSES: u64 = 4;
 
-/// Vehicles for which the costs are told.
+/// Number of vehicles for which the costs are reported.
 const COST_VEHICLES: usize = 32;
 
-/// Time for which they report while somebody looks at the page.
+/// Time for which the vehicles report while a browser shows the page.
 const LOOK: Duration = Duration::from_secs(4);
 
 /// The load at which the search begins.
@@ -195,7 +200,7 @@ impl BenchArguments {
         }
     }
 
-    /// The running cell to be measured, if it is to be one.
+    /// The running cell to be measured, if one is given.
     fn running_cell(&self) -> anyhow::Result<Option<Target>> {
         let config = self
             .config
@@ -237,7 +242,7 @@ impl BenchArguments {
     }
 }
 
-/// The cell beside the bare way, for each number of vehicles.
+/// The cell compared to the bare path, for each number of vehicles.
 async fn compare(
     target: &Target,
     arguments: &BenchArguments,
@@ -410,8 +415,8 @@ fn in_ms(us: Option<f64>) -> String {
     us.map_or_else(|| "-".to_owned(), |us| format!("{:.2}", us / 1000.0))
 }
 
-/// Costs of a node without camera, with the dashboard on and nobody looking, and of recording; then how soon
-/// somebody who looks sees something.
+/// Costs of a node without camera, with the dashboard enabled and unused, and of recording; then
+/// the time until a browser shows the first picture.
 async fn costs(
     program: &Path,
     arguments: &BenchArguments,
@@ -484,7 +489,7 @@ async fn costs(
     Ok(())
 }
 
-/// The door of a vehicle: what programs wait longer than their node, and what it costs.
+/// The local broker of a vehicle: the additional delay for programs, and its cost.
 async fn doors(
     program: &Path,
     arguments: &BenchArguments,

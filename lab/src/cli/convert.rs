@@ -18,10 +18,12 @@ pub(super) struct ConvertArguments {
     /// Form of the files
     #[arg(long, value_enum, value_name = "FORM")]
     format: FileFormat,
-    /// A vehicle, and the file of its detections or a directory with one for each sequence; may be given several times
+    /// A vehicle, and the file of its detections or a directory with one for each sequence; may be
+    /// given several times
     #[arg(long, value_name = "NAME=FILE", required = true, value_parser = of_vehicle)]
     vehicle: Vec<(NodeName, PathBuf)>,
-    /// A vehicle, and its configuration (TOML) with the camera whose boxes are in its file; may be given several times
+    /// A vehicle, and its configuration (TOML) with the camera whose boxes are in its file; may be
+    /// given several times
     #[arg(long, value_name = "NAME=FILE", value_parser = of_vehicle)]
     config: Vec<(NodeName, PathBuf)>,
     /// Frames a second

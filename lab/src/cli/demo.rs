@@ -32,7 +32,7 @@ const STREET: &str = "street";
 /// Flags of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct DemoArguments {
-    /// Scene file of parking lots [default: those of the paper's first setup, and the street]
+    /// Scene file of parking lots [default: the lots of the paper's first setup, and the street]
     #[arg(long, value_name = "FILE")]
     scenes: Option<PathBuf>,
     /// Run this scene only; `street` is the street
@@ -198,7 +198,7 @@ fn leaders(terms: &[JudgedTerm], start: Timestamp, judged: &str) -> String {
     terms.iter().map(line).collect()
 }
 
-/// Table of what each node knows of the street, alone and with the cell.
+/// Table of each node's knowledge of the street, alone and with the cell.
 fn street_table(street: &StreetResult) -> String {
     let columns = |known: &KnownShare| {
         format!(
@@ -258,7 +258,7 @@ fn file_name(scene: &str) -> String {
     scene.chars().map(allowed).collect()
 }
 
-/// Where every vehicle placed what it detected.
+/// Places of all vehicles' detections.
 fn detections(outcome: &DemoResult) -> Vec<(ecod::model::names::NodeName, Point2<f64>)> {
     let placed = |observed: &crate::demo::ObservedReport| {
         let node = observed.report.node.clone();

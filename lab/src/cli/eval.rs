@@ -1,4 +1,4 @@
-//! `ecod-lab eval`: how right the output of a replay is.
+//! `ecod-lab eval`: accuracy of the output of a replay.
 
 mod tracks;
 
@@ -27,18 +27,19 @@ use crate::report::tracks::percent;
 /// Flags of `eval`.
 #[derive(Debug, Args)]
 pub(super) struct EvalArguments {
-    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), the places of all objects (JSON), or
-    /// a file of --format
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), the places of
+    /// all objects (JSON), or a file of --format
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
-    /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a file of that form
+    /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a
+    /// file of that form
     #[arg(long, value_name = "FILE")]
     input: PathBuf,
     /// The reports that were replayed, for majority vote and every vehicle alone
     #[arg(long, value_name = "FILE")]
     reports: Option<PathBuf>,
-    /// Configuration of the cell (TOML), to place reported objects that name no location and for synonyms; with --format, of the
-    /// vehicle whose camera took the images, to place boxes
+    /// Configuration of the cell (TOML), to place reported objects that name no location and for
+    /// synonyms; with --format, of the vehicle whose camera took the images, to place boxes
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Form of a benchmark's files, or of all files in a directory
@@ -192,7 +193,8 @@ impl UnreadableLines {
     }
 }
 
-/// Gives every line that is not blank to `take`, with its number from 1; `None` for one that is too large.
+/// Passes every line that is not blank to `take`, with its number from 1; `None` for a line that is
+/// too large.
 fn each_line(
     path: &Path,
     limit: usize,
@@ -288,7 +290,7 @@ fn name_of(label: &Option<Label>) -> String {
     label.as_deref().unwrap_or("-").to_owned()
 }
 
-/// What follows a table of which [`MAX_ROWS`] rows are printed.
+/// The note after a table of which [`MAX_ROWS`] rows are printed.
 fn rest(rows: usize) -> String {
     let more = rows.saturating_sub(MAX_ROWS);
     if more > 0 {

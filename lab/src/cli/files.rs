@@ -24,7 +24,7 @@ pub(super) fn camera(config: Option<&Path>) -> Result<Option<StandingCamera>, Fa
     config.map(load).transpose().map_err(Failure::usage)
 }
 
-/// Reads a file, or all of a directory, and says which boxes have no place.
+/// Reads a file, or all of a directory, and prints which boxes have no place.
 pub(super) fn read(
     format: FileFormat,
     path: &Path,

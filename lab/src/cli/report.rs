@@ -1,4 +1,4 @@
-//! `ecod-lab report`: a log as one page, judged by what is true.
+//! `ecod-lab report`: a log as one page, evaluated against the truth.
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,8 @@ use crate::report::{judged_by, judged_by_tracks};
 pub(super) struct LogReportArguments {
     #[command(flatten)]
     page: PageArguments,
-    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places
+    /// of all objects (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
 }
@@ -30,7 +31,7 @@ pub(super) fn run(arguments: &LogReportArguments) -> Result<(), Failure> {
     page(&arguments.page, report, truth, "ecod-lab")
 }
 
-/// A report that judges by the truth in this file.
+/// A report that is evaluated against the truth in this file.
 fn judged(path: &Path) -> anyhow::Result<Report> {
     let text =
         bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;

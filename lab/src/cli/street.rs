@@ -1,4 +1,4 @@
-//! `ecod-lab street`: what `ecod-node try` looks at when it is told nothing.
+//! `ecod-lab street`: the scene that `ecod-node try` shows by default.
 
 use std::fs;
 use std::path::PathBuf;

@@ -1,4 +1,5 @@
-//! `ecod-lab testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a recorded intersection.
+//! `ecod-lab testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a
+//! recorded intersection.
 
 mod intersection;
 
@@ -43,11 +44,12 @@ pub(super) struct TestbedArguments {
     /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
     #[arg(long, value_name = "FILE")]
     pub(super) reports: Option<PathBuf>,
-    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded detections, fewer verdicts
-    /// of the recording, or of the generated scenes if only they are chosen
+    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded
+    /// detections, fewer verdicts of the recording, or of the generated scenes if only they are
+    /// chosen
     #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) at_least: Option<f64>,
-    /// The same of the occupied spots alone; as `--at-least` if not given
+    /// The same limit for the occupied spots alone; default: the value of `--at-least`
     #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) occupied_at_least: Option<f64>,
     /// Write the results to this file (JSON)
@@ -104,7 +106,7 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
                 .with_context(|| format!("scene {}", scene.name))?,
         );
         bar.finish_and_clear();
-        // After each scene: what was judged stays, whatever becomes of the rest.
+        // After each scene: finished results are kept, even if a later scene fails.
         if let Some(out) = &arguments.out {
             write_json(out, &Results { scenes: &results })?;
         }
@@ -161,7 +163,7 @@ pub(super) fn select<'a>(
     })?])
 }
 
-/// Finds out before a long run that its results cannot be written; leaves nothing behind.
+/// Checks before a long run that its results can be written; leaves no file behind.
 pub(super) fn check_writable(path: &Path) -> anyhow::Result<()> {
     let was_there = path.exists();
     let opened = fs::File::options()

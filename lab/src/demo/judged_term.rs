@@ -1,4 +1,4 @@
-//! Terms of a cell's leaders, and how long its vehicles waited at each change.
+//! Terms of a cell's leaders, and the gap for its vehicles at each change.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -8,23 +8,24 @@ use ecod::model::time::Timestamp;
 use ecod::wire::GlobalMap;
 use ecod_actors::messages::newest::ReceivedMap;
 
-/// A leadership as the vehicles saw it.
+/// A leadership as observed by the vehicles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JudgedTerm {
     /// Leader and term.
     pub epoch: Epoch,
-    /// When the first vehicle took the first map.
+    /// Time when the first vehicle accepted the first map.
     pub from: Timestamp,
-    /// When the last vehicle took the last map.
+    /// Time when the last vehicle accepted the last map.
     pub until: Timestamp,
-    /// Longest time that a vehicle waited from the last map of another leader to the first of this one; none when there
-    /// was no other.
+    /// Longest time that a vehicle waited from the last map of another leader to the first map of
+    /// this one; `None` for the first leader.
     pub gap: Option<Duration>,
-    /// Share of what is true that the maps have, in percent.
+    /// Share of the truth that the maps contain, in percent.
     pub right_pct: f64,
 }
 
-/// All leaderships in the order of their terms, from what each vehicle took in its order; `right_pct` judges the maps of one.
+/// All leaderships in the order of their terms, from the maps that each vehicle accepted in order;
+/// `right_pct` evaluates the maps of one.
 pub(super) fn judged_terms<'a>(
     vehicles: impl IntoIterator<Item = &'a [ReceivedMap]>,
     right_pct: impl Fn(&[&GlobalMap]) -> f64,

@@ -1,4 +1,4 @@
-//! Listens to every report of the cell, on whichever brokers it comes, and notes who leads.
+//! Receives every report of the cell on all brokers, and records the leaders.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,12 +15,12 @@ use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-/// A report and when it came.
+/// A report and its time of receipt.
 #[derive(Debug, Clone)]
 pub struct ObservedReport {
     /// The report.
     pub report: Arc<ObjectReport>,
-    /// When it came, by this process's clock.
+    /// Time of receipt by this process's clock.
     pub received_at: Timestamp,
 }
 
@@ -82,7 +82,7 @@ impl ReportCollector {
             .len()
     }
 
-    /// Whose map came last.
+    /// The node whose map arrived last.
     pub(super) fn leader(&self) -> Option<NodeName> {
         lock(&self.seen).leader.clone()
     }
@@ -92,7 +92,7 @@ impl ReportCollector {
         lock(&self.seen).reports.len()
     }
 
-    /// Ends listening and gives all reports in the order of receipt.
+    /// Stops and returns all reports in the order of receipt.
     pub(super) async fn stop(self) -> Vec<ObservedReport> {
         self.gateway.stop(None);
         if self.ended.await.is_err() {

@@ -1,4 +1,5 @@
-//! The processes of a demo: started, watched, the edge killed half-way and started again, and stopped.
+//! The processes of a demo: started, watched, the edge killed half-way and started again, and
+//! stopped.
 
 use std::fs;
 use std::net::SocketAddr;
@@ -30,7 +31,7 @@ pub struct Progress {
 /// Event of a running demo.
 #[derive(Debug, Clone, Copy)]
 pub enum News {
-    /// So many reports were seen so far.
+    /// Number of reports received so far.
     Reports(usize),
     /// The edge's process was killed.
     EdgeKilled,
@@ -49,7 +50,7 @@ pub(super) struct Played {
     pub(super) restarted_at: Option<Timestamp>,
 }
 
-/// Time for all nodes to start and see.
+/// Time for all nodes to start and detect objects.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Time for which the edge is gone.
@@ -58,7 +59,7 @@ const EDGE_GONE: Duration = Duration::from_secs(1);
 /// Time from the first reports of all vehicles to the first map that is judged: the memory of PACE.
 const SETTLING: Duration = Duration::from_secs(1);
 
-/// Where a node listens: its broker, for other nodes, and for poses.
+/// Addresses of a node: of its broker, for other nodes, and for poses.
 #[derive(Debug, Clone, Copy)]
 struct NodeAddresses {
     broker: SocketAddr,
@@ -74,7 +75,7 @@ pub(super) struct Stage<'a> {
 }
 
 impl<'a> Stage<'a> {
-    /// A stage for so many nodes; nothing of an earlier cell stays in the directory.
+    /// A stage for a number of nodes; files of an earlier cell are removed from the directory.
     pub(super) fn new(
         program: &'a Path,
         directory: &'a Path,
@@ -107,8 +108,8 @@ impl<'a> Stage<'a> {
         self.addresses[node].poses
     }
 
-    /// Runs the nodes, of which the first is the edge; the others may lead, and the first of them serves its page at `dashboard`.
-    /// All are stopped in any case.
+    /// Runs the nodes, of which the first is the edge; the others may lead, and the first of them
+    /// serves its page at `dashboard`. All are stopped in any case.
     pub(super) async fn play(
         &self,
         configs: Vec<NodeConfig>,
@@ -156,7 +157,7 @@ impl<'a> Stage<'a> {
         })
     }
 
-    /// The maps that a vehicle got, in order.
+    /// The maps that a vehicle received, in order.
     pub(super) fn map_log(&self, vehicle: &NodeName) -> anyhow::Result<Vec<ReceivedMap>> {
         let path = self.map_log_file(vehicle);
         let text =
@@ -203,8 +204,8 @@ impl<'a> Stage<'a> {
     }
 }
 
-/// Waits for reports of all vehicles and maps of the edge, then for the time to be judged, in which the edge is killed and
-/// started again, and says when that was.
+/// Waits for reports of all vehicles and maps of the edge, then for the evaluated time, during
+/// which the edge is killed and restarted. Returns the times of these events.
 async fn watch(
     nodes: &mut [NodeProcess],
     collector: &ReportCollector,

@@ -1,4 +1,5 @@
-//! The street live: every camera is on the network, every node is a process, and all is judged by what is true.
+//! The street live: every camera is on the network, every node is a process, and the results are
+//! evaluated against the truth.
 //!
 //! ```text
 //! street ── renders ──> network cameras ── MJPEG over HTTP ──> ecod-node × 4
@@ -49,9 +50,9 @@ pub struct StreetDemo<'a> {
     pub program: &'a Path,
     /// Time for which the maps are judged.
     pub duration: Duration,
-    /// Where configurations and logs go.
+    /// Directory for configurations and logs.
     pub directory: &'a Path,
-    /// Where the first vehicle serves its page.
+    /// Address of the first vehicle's page.
     pub dashboard: SocketAddr,
 }
 
@@ -60,7 +61,7 @@ pub struct StreetDemo<'a> {
 pub struct StreetOutcome {
     /// Figures.
     pub result: StreetResult,
-    /// From when on the maps are judged.
+    /// Time from which on the maps are evaluated.
     pub from: Timestamp,
     /// Terms of all leaders, in order.
     pub terms: Vec<JudgedTerm>,
@@ -73,28 +74,31 @@ pub struct StreetOutcome {
 pub struct StreetResult {
     /// Cars and people in the street.
     pub objects: usize,
-    /// Each node alone: what it knows from its own reports.
+    /// Each node alone: its knowledge from its own reports.
     pub alone: BTreeMap<NodeName, KnownShare>,
-    /// Each node with the cell: what it knows from the maps that it got.
+    /// Each node with the cell: its knowledge from the maps that it received.
     pub with_cell: BTreeMap<NodeName, KnownShare>,
     /// Leaders in order.
     pub leaders: Vec<NodeName>,
-    /// The node that led after the edge was killed; null when nobody did.
+    /// The node that led after the edge was killed; null if there was no such node.
     pub took_over: Option<NodeName>,
-    /// Longest time that a node waited for its first map then, in ms; null also when that node led before.
+    /// Longest time that a node waited for its first map then, in ms; null also when that node led
+    /// before.
     pub failover_gap_ms: Option<u64>,
-    /// People of whom a single node told the cell, at least once: those nodes, each with the number of such people.
+    /// People whom only a single node reported to the cell, at least once: these nodes, each with
+    /// the number of such people.
     pub seen_only_by: BTreeMap<NodeName, usize>,
 }
 
-/// Knowledge of a node about the street, judged every tenth of a second. An object counts as known within 2 m.
+/// A node's knowledge of the street, evaluated every tenth of a second. An object counts as
+/// detected within 2 m.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct KnownShare {
-    /// Objects that it knows at a time, the mean.
+    /// Mean number of objects that the node has at a time.
     pub known: f64,
-    /// Share of what it takes for an object that is one, in percent.
+    /// Share of the node's objects that are real, in percent.
     pub precision_pct: f64,
-    /// Share of the objects that it knows, in percent.
+    /// Share of the real objects that the node has, in percent.
     pub recall_pct: f64,
 }
 
@@ -105,10 +109,11 @@ const STEP: Duration = Duration::from_millis(100);
 const POSE_PERIOD: Duration = Duration::from_millis(50);
 
 impl StreetDemo<'_> {
-    /// Runs the street; `progress` is told once a second.
+    /// Runs the street; `progress` is called once a second.
     ///
     /// # Errors
-    /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
+    /// Returns an error if a node does not start or ends early, `progress` fails, or a file cannot
+    /// be written; all nodes are stopped in any case.
     pub async fn run(
         &self,
         progress: impl Fn(Progress) -> anyhow::Result<()>,
@@ -195,7 +200,8 @@ fn edge_name() -> NodeName {
     NodeName::from_static("edge")
 }
 
-/// Configuration that all nodes share. They gossip on loopback, where they meet no other cell of this machine.
+/// Configuration that all nodes share. They gossip on loopback, apart from other cells of this
+/// machine.
 fn cell() -> NodeConfig {
     let membership = MembershipConfig {
         multicast: MulticastConfig {
@@ -225,7 +231,8 @@ fn fusion() -> FusionConfig {
     }
 }
 
-/// Configuration of the node of a camera that shows `source`; `poses` is where one that drives hears where it is.
+/// Configuration of the node of a camera that shows `source`; `poses` is the address at which a
+/// driving node receives its poses.
 pub(crate) fn camera_node(
     street: &Street,
     camera: &StreetCamera,
@@ -282,7 +289,7 @@ pub(crate) fn camera_node(
     }
 }
 
-/// A placard stands up to 0.8 m before the middle of what wears it.
+/// A placard stands up to 0.8 m in front of the middle of its wearer.
 fn projection(street: &Street) -> ProjectionConfig {
     ProjectionConfig {
         sizes: street.code_sizes(),
@@ -294,7 +301,8 @@ fn projection(street: &Street) -> ProjectionConfig {
     }
 }
 
-/// Sends the poses of the cameras that drive to their nodes, as a vehicle's localisation does; never ends by itself.
+/// Sends the poses of the driving cameras to their nodes, like a vehicle's localisation; does not
+/// return.
 async fn send_poses(
     street: Arc<Street>,
     driving: Vec<(usize, SocketAddr)>,
@@ -313,7 +321,7 @@ async fn send_poses(
                 "heading_rad": pose.heading_rad,
                 "captured_at_us": now.shifted(clock::wall_offset_us()),
             });
-            // Nobody listens yet, or any more.
+            // The node may not be listening yet, or not any more.
             let _ = socket.send_to(fix.to_string().as_bytes(), address);
         }
     }
@@ -435,7 +443,7 @@ impl Judge<'_> {
         })
     }
 
-    /// Knowledge of a node that got these maps.
+    /// Knowledge of a node that received these maps.
     fn share(&self, maps: &[ReceivedMap]) -> KnownShare {
         let (mut frames, mut at, mut next, mut ids) = (Vec::new(), self.from, 0, HashMap::new());
         while at <= self.until {
@@ -540,7 +548,8 @@ mod tests {
                     let error_m = truth
                         .map(|known| nalgebra::distance(&known.position, &place))
                         .fold(f64::MAX, f64::min);
-                    // Half of a car's placards, and what the corners of a small code may be off.
+                    // Half the length between a car's placards, and the error of a small code's
+                    // corners.
                     let allowed_m = 0.8
                         + 0.05 * nalgebra::distance(&place, &street.pose(camera, at_s).position);
                     let (name, label) = (&camera.name, &object.label);

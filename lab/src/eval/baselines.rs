@@ -1,8 +1,8 @@
-//! What is done elsewhere with the same reports: one vehicle alone, all together, and late fusion.
+//! Baselines on the same reports: one vehicle alone, the union of all vehicles, and late fusion.
 //!
-//! Late fusion as OPV2V and V2V4Real have it: what all vehicles found, with non-maximum suppression by score, here by
-//! centre distance. Identities come from a tracker as plain as AB3DMOT's (Weng et al., IROS 2020): a constant velocity
-//! and the nearest detection.
+//! Late fusion as in OPV2V and V2V4Real: the objects of all vehicles, with non-maximum suppression
+//! by score, here by centre distance. Identities come from a tracker as simple as AB3DMOT's (Weng
+//! et al., IROS 2020): a constant velocity and the nearest detection.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -16,10 +16,10 @@ use super::tracks::SaidObject;
 
 /// Age beyond which a vehicle's last report is not used.
 const MAX_AGE: Duration = Duration::from_millis(300);
-/// Distances within which the suppression takes two cars, and two of anything else, for one.
+/// Distances within which the suppression merges two cars, and two other objects.
 const SAME_CAR_M: f64 = 2.0;
 const SAME_OTHER_M: f64 = 1.0;
-/// The tracker's gate, what a new velocity counts, and how long it waits for what is gone.
+/// The tracker's gate, the weight of a new velocity, and the time for which a lost object is kept.
 const GATE_M: f64 = 3.0;
 const GAIN: f64 = 0.3;
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -32,7 +32,7 @@ pub struct FoundObject {
     position: Point2<f64>,
 }
 
-/// All that one report says, the vehicle itself too if its pose is known.
+/// All objects of one report, including the vehicle itself if its pose is stated.
 pub fn found(report: &ObjectReport) -> Vec<FoundObject> {
     let objects = report.objects.iter().map(|object| FoundObject {
         label: object.label.clone(),
@@ -55,7 +55,7 @@ pub fn found(report: &ObjectReport) -> Vec<FoundObject> {
 pub struct LatestReports(BTreeMap<NodeName, (Timestamp, Vec<FoundObject>)>);
 
 impl LatestReports {
-    /// Takes a report, unless a later one is there already.
+    /// Stores a report, unless a later one is already stored.
     pub fn report(&mut self, report: &ObjectReport) {
         let last = self.0.entry(report.node.clone()).or_default();
         if report.captured_at_us > last.0 {
@@ -73,7 +73,7 @@ impl LatestReports {
     }
 }
 
-/// Of those of one label near each other, the one with the highest score.
+/// Among objects with one label near each other, keeps the one with the highest score.
 pub fn suppressed(mut found: Vec<FoundObject>) -> Vec<FoundObject> {
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut kept: Vec<FoundObject> = Vec::new();
@@ -93,7 +93,7 @@ pub fn suppressed(mut found: Vec<FoundObject>) -> Vec<FoundObject> {
     kept
 }
 
-/// Gives identities to what is found.
+/// Assigns identities to detected objects.
 #[derive(Debug, Default)]
 pub struct NearestTracker {
     tracks: Vec<NearestTrack>,
@@ -110,7 +110,7 @@ struct NearestTrack {
 }
 
 impl NearestTracker {
-    /// Takes what is there at a time.
+    /// Processes the objects present at a time.
     pub fn track(&mut self, at: Timestamp, found: &[FoundObject]) -> Vec<SaidObject> {
         self.tracks.retain(|track| at.since(track.at) <= PATIENCE);
         let mut pairs = Vec::new();

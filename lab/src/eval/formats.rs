@@ -1,7 +1,9 @@
-//! Files of benchmarks, as truth and as what a tracker or a detector said: KITTI tracking, MOTChallenge and COCO.
+//! Files of benchmarks, as truth and as output of a tracker or detector: KITTI tracking,
+//! MOTChallenge and COCO.
 //!
-//! Frames are numbered in these files; frame n is n periods after the first. Positions are on the ground, in metres; boxes in an
-//! image are placed there by the camera that took it. A directory is a sequence for each file, by name, a thousand seconds apart.
+//! Frames are numbered in these files; frame n is n periods after the first. Positions are on the
+//! ground, in metres; boxes in an image are placed there by the camera that took the image. A
+//! directory contains one sequence per file, by name, a thousand seconds apart.
 
 mod coco;
 mod kitti;
@@ -32,24 +34,27 @@ const SEQUENCE_US: u64 = 1_000_000_000;
 /// The form of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FileFormat {
-    /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x forward, y left
+    /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x
+    /// forward, y left
     Kitti,
-    /// MOTChallenge: positions on the ground (columns 8 and 9), as 3D MOT 2015 has them, or boxes of the camera in --config
+    /// MOTChallenge: positions on the ground (columns 8 and 9), as 3D MOT 2015 has them, or boxes
+    /// of the camera in --config
     Mot,
-    /// COCO: a dataset with annotations, or results; image n is frame n, with boxes of the camera in --config
+    /// COCO: a dataset with annotations, or results; image n is frame n, with boxes of the camera
+    /// in --config
     Coco,
 }
 
 /// An object in a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileObject {
-    /// Its identity in its sequence; none for detections.
+    /// Its identity in its sequence; `None` for detections.
     pub id: Option<i64>,
     /// Its class, its confidence (of truth, 1) and its place on the ground.
     pub perceived: PerceivedObject,
 }
 
-/// An object as its file says it.
+/// An object as stated in its file.
 #[derive(Debug, Clone, PartialEq)]
 struct ParsedObject {
     id: Option<i64>,
@@ -59,12 +64,11 @@ struct ParsedObject {
     place: FilePlace,
 }
 
-/// Where a file has an object.
+/// The place of an object in a file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum FilePlace {
     /// On the ground, in metres.
     Ground(Point2<f64>),
-    /// In the image.
     Image(BoundingBox),
 }
 
@@ -129,17 +133,17 @@ impl Sequence {
 pub struct LineError {
     /// Its number, from 1.
     pub line: usize,
-    /// The column and what it should be.
+    /// The column and its expected content.
     pub field: String,
-    /// What is wrong with it.
+    /// The fault.
     pub fault: String,
 }
 
 impl FileFormat {
-    /// The file, or all of a directory with the ending of the form, by name.
+    /// The file, or all files of a directory with the extension of the format, sorted by name.
     ///
     /// # Errors
-    /// When there is none.
+    /// Returns an error if there is no such file.
     pub fn files(self, path: &Path) -> anyhow::Result<Vec<PathBuf>> {
         if !path.is_dir() {
             return Ok(vec![path.to_owned()]);
@@ -164,10 +168,11 @@ impl FileFormat {
         }
     }
 
-    /// Reads a file, or all of a directory with the ending of the form. Boxes are those of `camera`.
+    /// Reads a file, or all files of a directory with the extension of the format. Boxes are seen
+    /// by `camera`.
     ///
     /// # Errors
-    /// Naming file, line and field.
+    /// Returns an error that names file, line and field.
     pub fn read(
         self,
         path: &Path,
@@ -221,7 +226,7 @@ impl FileFormat {
         standing_camera::placed(parsed, camera, sequence)
     }
 
-    /// Reads the text of a file; one with boxes needs a camera.
+    /// Reads the text of a file; a file with boxes needs a camera.
     fn parse(self, text: &str, has_camera: bool) -> anyhow::Result<ParsedFrames> {
         let text = text.trim_start_matches('\u{feff}');
         Ok(match self {
@@ -263,7 +268,8 @@ impl FileFormat {
     }
 }
 
-/// The number of a frame, if it is plausible. All frames up to the last make a report, also those without objects.
+/// The number of a frame, if it is plausible. All frames up to the last make a report, also those
+/// without objects.
 fn frame_number(number: i64) -> Option<u64> {
     (0..1_000_000).contains(&number).then_some(number as u64)
 }
@@ -281,7 +287,7 @@ pub fn sequence_at(time: Timestamp) -> usize {
 /// Checks that no sequence, of several, lasts into the next one.
 ///
 /// # Errors
-/// Naming the sequence.
+/// Returns an error that names the sequence.
 pub fn check_lengths<'a>(
     sequences: impl IntoIterator<Item = &'a Sequence>,
     frame_rate_hz: f64,
@@ -299,12 +305,12 @@ pub fn check_lengths<'a>(
     }
 }
 
-/// Log-odds beyond which they are compressed, and the most that comes of it: otherwise probabilities would be too near to 1 to
-/// be told apart.
+/// Log-odds above which values are compressed, and the upper limit of the result: otherwise
+/// probabilities would be too close to 1 to be distinguished.
 const LARGE_LOG_ODDS: f64 = 20.0;
 const MAX_LOG_ODDS: f64 = 30.0;
 
-/// If any score is not within 0 to 1, all are taken for log-odds. Their order stays.
+/// If any score is outside 0 to 1, all scores are interpreted as log-odds. Their order is kept.
 fn as_probabilities(files: &mut [ParsedFrames]) {
     let objects = files.iter_mut().flat_map(BTreeMap::values_mut).flatten();
     let mut scores: Vec<&mut f64> = objects.map(|object| &mut object.score).collect();

@@ -32,7 +32,8 @@ fn report(node: &str, at: u64, votes: &[(&str, &str)]) -> ObjectReport {
     }
 }
 
-/// Five items, worked out by hand: a is right, b wrong, c never labelled, d empty and said so, e without truth.
+/// Five items, computed by hand: a is right, b wrong, c unlabelled, d empty and labelled so, e
+/// without truth.
 #[test]
 fn figures_are_those_worked_out_by_hand() {
     let truth = Truth::parse(r#"{"landmarks": {"a": "cup", "b": "cup", "c": "mouse", "d": null}}"#)

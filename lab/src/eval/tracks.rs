@@ -1,11 +1,14 @@
-//! Accuracy of the objects of maps: detection, localisation and identity against a truth that moves.
+//! Accuracy of the objects of maps: detection, localisation and identity against a truth that
+//! moves.
 //!
-//! An object of a map can be taken for a true one of the same label that is near enough. Detection is judged by average
-//! precision at four distances and by the best F1; then, at a threshold on the confidence, by MODA and MODP, CLEAR MOT,
-//! IDF1 and HOTA. Stated probabilities are judged by their calibration. Definitions and sources stand with each part; `docs/evaluation.md` has them together.
+//! An object of a map can be matched with a true object of equal label that is near enough.
+//! Detection is evaluated by average precision at four distances and by the best F1; then, at a
+//! threshold on the confidence, by MODA and MODP, CLEAR MOT, IDF1 and HOTA. Stated probabilities
+//! are evaluated by their calibration. Definitions and sources are given with each part, and
+//! together in `docs/evaluation.md`.
 //!
-//! Call [`TrackEvaluation::map`] with every map of a replay, in order, then [`TrackEvaluation::result`]. Output of
-//! other programs is judged by [`score`].
+//! Call [`TrackEvaluation::map`] with every map of a replay, in order, then
+//! [`TrackEvaluation::result`]. Output of other programs is evaluated by [`score`].
 
 mod calibration;
 mod clear;
@@ -36,21 +39,23 @@ use super::percent;
 /// Distances in metres at which average precision is given.
 pub const AP_DISTANCES_M: [f64; 4] = [0.5, 1.0, 2.0, 4.0];
 
-/// Distance in metres up to which an object can be taken for a true one, in all but average precision and HOTA.
+/// Maximum distance in metres between matched objects, except in average precision and HOTA.
 pub const MATCH_DISTANCE_M: f64 = 2.0;
 
-/// Distance in metres at which two places are no longer similar at all; HOTA averages over distances below it. At half
-/// of it the similarity 1 − d/d₀ is 0.5, the usual threshold, at [`MATCH_DISTANCE_M`].
+/// Distance in metres at which the similarity of two places becomes zero; HOTA averages over
+/// distances below it. At half of it the similarity 1 − d/d₀ is 0.5, the usual threshold, at
+/// [`MATCH_DISTANCE_M`].
 pub const ZERO_DISTANCE_M: f64 = 2.0 * MATCH_DISTANCE_M;
 
-/// Confidence from which an object counts when nobody chooses.
+/// Default confidence from which an object counts.
 pub const DEFAULT_THRESHOLD: f64 = 0.5;
 
-/// Share of a frame period that a map may be from a frame. Half of it would leave frames without a map wherever rounds
-/// jitter about the middle between two frames; a whole one would not see that a map is missing.
+/// Maximum distance of a map from a frame, as a share of the frame period. A half would leave
+/// frames without a map if rounds jitter about the middle between two frames; a whole period would
+/// hide missing maps.
 const REACH: f64 = 0.75;
 
-/// One moment: what stood where, and what was said.
+/// One moment: the true objects and the reported objects.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ScoredFrame {
     /// True objects, each id once.
@@ -59,7 +64,7 @@ pub struct ScoredFrame {
     pub said: Vec<SaidObject>,
 }
 
-/// An object that was there.
+/// A true object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueObject {
     /// Its identity; small numbers, they count places in tables.
@@ -70,14 +75,14 @@ pub struct TrueObject {
     pub position: Point2<f64>,
 }
 
-/// An object that was said to be there.
+/// A reported object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SaidObject {
     /// The identity it was given; small numbers, they count places in tables.
     pub id: u32,
     /// The class it was given.
     pub label: Label,
-    /// Confidence that it is there; only the order matters to average precision.
+    /// Confidence that the object exists; for average precision only the order matters.
     pub score: f64,
     /// Probability that it exists, wherever exactly, if it is stated apart.
     pub existence: Option<f64>,
@@ -99,16 +104,16 @@ impl SaidObject {
     }
 }
 
-/// Result of an evaluation. Shares are percentages; `None` where nothing could be judged.
+/// Result of an evaluation. Shares are percentages; `None` without evaluated objects.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackScores {
     /// Frames of the truth.
     pub frames: u64,
-    /// Those with a map; all objects of the others are missed.
+    /// Number of frames with a map; all objects of other frames count as missed.
     pub frames_with_map: u64,
     /// True objects, each in every frame.
     pub objects: u64,
-    /// Objects that were said, whatever their confidence, in the frames.
+    /// Number of reported objects in the frames, of any confidence.
     pub said: u64,
     /// Average precision at [`AP_DISTANCES_M`], the mean over the classes of the truth.
     pub ap_pct: [Option<f64>; AP_DISTANCES_M.len()],
@@ -116,27 +121,28 @@ pub struct TrackScores {
     pub class_ap_pct: BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]>,
     /// Greatest F1 at [`MATCH_DISTANCE_M`] over all thresholds, all classes together.
     pub best_f1_pct: Option<f64>,
-    /// Greatest MODA at [`AP_DISTANCES_M`] over all thresholds, all classes together. Matches are those of average precision.
+    /// Greatest MODA at [`AP_DISTANCES_M`] over all thresholds, all classes together, with the
+    /// matches of average precision.
     pub best_moda_pct: [Option<f64>; AP_DISTANCES_M.len()],
     /// At the threshold of the greatest F1.
     pub at_best_f1: ThresholdScores,
     /// At [`DEFAULT_THRESHOLD`].
     pub at_default: ThresholdScores,
-    /// Calibration of the stated probabilities, whatever the threshold.
+    /// Calibration of the stated probabilities, independent of the threshold.
     pub calibration: ReliabilityBins,
 }
 
-/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
-/// together.
+/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all
+/// classes together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThresholdScores {
     /// The threshold.
     pub threshold: f64,
-    /// Objects said that were taken for a true one.
+    /// Reported objects that matched a true one.
     pub matches: u64,
-    /// Objects said that were not.
+    /// Reported objects without a match.
     pub false_alarms: u64,
-    /// True objects that none was taken for.
+    /// True objects without a match.
     pub misses: u64,
     /// Times that a true object was given another identity than before.
     pub id_switches: u64,
@@ -158,7 +164,7 @@ pub struct ThresholdScores {
     pub deta_pct: Option<f64>,
     /// Its part of association.
     pub assa_pct: Option<f64>,
-    /// Mean similarity of what it matched.
+    /// Mean similarity of the matches.
     pub loca_pct: Option<f64>,
 }
 
@@ -229,12 +235,13 @@ fn at_threshold(frames: &[ScoredFrame], threshold: f64) -> ThresholdScores {
     }
 }
 
-/// Takes the maps of a replay apart; see the module.
+/// Evaluates the maps of a replay; see the module.
 ///
-/// A map says what stands where at its `fused_at_us`. A frame is judged by the map nearest in time, the later of two as
-/// near, if it is within three quarters of a frame period, the median of the truth; and by where the true objects were
-/// at the time of the map, on a straight line between the two frames about it. Without a map, all objects of a frame
-/// are missed.
+/// A map states the positions of objects at its `fused_at_us`. A frame is evaluated by the nearest
+/// map in time (the later one if two are equally near), if it is within three quarters of a frame
+/// period, where the period is the median of the truth. True objects are interpolated to the time
+/// of the map, on a straight line between the two frames around it. Without a map, all objects of a
+/// frame count as missed.
 #[derive(Debug, Clone)]
 pub struct TrackEvaluation {
     truth: TrackTruth,
@@ -245,7 +252,7 @@ pub struct TrackEvaluation {
 }
 
 impl TrackEvaluation {
-    /// Nothing read yet.
+    /// An evaluation without any input yet.
     pub fn new(truth: TrackTruth) -> Self {
         let reach_us = (REACH * truth.period_us() as f64) as i64;
         Self {
@@ -264,7 +271,7 @@ impl TrackEvaluation {
         self.said(map.fused_at_us, &said);
     }
 
-    /// Takes what was said, in any other way, to be there at a time.
+    /// Adds objects reported at a time by any other program.
     pub fn said(&mut self, at: Timestamp, said: &[SaidObject]) {
         let frames = self.truth.frames();
         let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
@@ -319,13 +326,13 @@ impl TrackEvaluation {
         scores
     }
 
-    /// Takes what the files of a benchmark say, frame by frame.
+    /// Adds the contents of a benchmark's files, frame by frame.
     pub fn sequences(&mut self, sequences: &[Sequence], frame_rate_hz: f64) {
         let times: Vec<Timestamp> = self.truth.frames().iter().map(|frame| frame.at).collect();
         let mut said: BTreeMap<Timestamp, Vec<SaidObject>> =
             times.into_iter().map(|at| (at, Vec::new())).collect();
         let mut ids: HashMap<(usize, i64), u32> = HashMap::new();
-        // Detections have no identity: none goes on.
+        // Detections have no identity, so every detection gets a new one.
         let mut next = 0;
         for (number, sequence) in sequences.iter().enumerate() {
             for (frame, objects) in &sequence.frames {

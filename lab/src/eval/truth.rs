@@ -1,4 +1,4 @@
-//! Ground truth of known locations: the label of each, and since when.
+//! Ground truth of landmarks: the label of each, and since when.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,7 +10,7 @@ use serde_json::Value;
 /// Default text of a sign of vacancy.
 const VACANT: &str = "EMPTY";
 
-/// The true label of every location that is judged; others are not.
+/// The true label of every evaluated location.
 ///
 /// As JSON, `{"landmarks": {…}}` or the inner object alone, each location with one of
 ///
@@ -21,8 +21,8 @@ const VACANT: &str = "EMPTY";
 /// [{"from_us": 0, "label": "cup"}, {"from_us": 17, "label": null}]   changes with time
 /// ```
 ///
-/// and optionally `"empty": ["EMPTY"]`, the labels that say that nothing is there; or as CSV (RFC 4180) with the header
-/// `item,truth`, of which an empty truth is null.
+/// and optionally `"empty": ["EMPTY"]`, the labels that stand for an empty location; or as CSV (RFC
+/// 4180) with the header `item,truth`, of which an empty truth is null.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Truth {
     landmarks: BTreeMap<LandmarkId, Vec<LabelSpan>>,
@@ -33,12 +33,12 @@ pub struct Truth {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct LabelSpan {
     from: Timestamp,
-    /// Any of these is right; the first names it. `None` is nothing.
+    /// All accepted labels; the first is used as the name. `None` is an empty location.
     accepted: Vec<Option<Label>>,
 }
 
 impl LabelSpan {
-    /// The first accepted label, `None` where nothing stands.
+    /// The first accepted label, `None` for an empty location.
     pub(super) fn name(&self) -> Option<&Label> {
         self.accepted.first().and_then(Option::as_ref)
     }
@@ -47,10 +47,10 @@ impl LabelSpan {
 /// A truth file that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TruthError {
-    /// Neither an object nor a table with the header `item,truth`.
+    /// The file is not an object and not a table with the header `item,truth`.
     #[error("truth is neither a json object nor a table with the columns item,truth: {0}")]
     NeitherForm(String),
-    /// A location's truth is none of the forms.
+    /// A location's truth has an invalid form.
     #[error("truth of `{landmark}` {reason}")]
     Location {
         /// The location.
@@ -67,7 +67,7 @@ impl Truth {
     /// Reads either form.
     ///
     /// # Errors
-    /// [`TruthError`] naming the location and what is wrong with it.
+    /// Returns a [`TruthError`] that names the location and the fault.
     pub fn parse(text: &str) -> Result<Self, TruthError> {
         let text = text.trim_start_matches('\u{feff}');
         let truth = if text.trim_start().starts_with('{') {
@@ -162,7 +162,8 @@ impl Truth {
         })
     }
 
-    /// Truth at a location, with the position of its span among the location's; `None` where none is known.
+    /// Truth at a location, with the position of its span among the location's spans; `None` if
+    /// there is no truth.
     pub(super) fn at(&self, landmark: &LandmarkId, time: Timestamp) -> Option<(usize, &LabelSpan)> {
         let spans = self.landmarks.get(landmark)?;
         spans
@@ -179,7 +180,7 @@ impl Truth {
             .flat_map(|(id, spans)| spans.iter().enumerate().map(move |(n, span)| (id, n, span)))
     }
 
-    /// True if the label, or none, is right.
+    /// True if the label (or its absence) is right.
     pub(super) fn accepts(&self, span: &LabelSpan, label: Option<&Label>) -> bool {
         let said_empty = label.is_some_and(|label| self.empty.contains(label));
         span.accepted

@@ -12,14 +12,14 @@ use serde::Serialize;
 use super::truth::Truth;
 use super::{Item, percent};
 
-/// One vehicle alone. Shares are percentages; `None` where nothing could be judged.
+/// One vehicle alone. Shares are percentages; `None` without evaluated items.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct VehicleScores {
-    /// Votes on locations whose truth is known.
+    /// Votes on locations with a truth.
     pub votes: u64,
     /// Right votes of these.
     pub vote_accuracy_pct: Option<f64>,
-    /// Items that it voted on, of all at which something stands.
+    /// Share of items that it voted on, among the items with an object.
     pub coverage_pct: Option<f64>,
     /// Right items of all when it alone decides.
     pub accuracy_pct: Option<f64>,
@@ -117,7 +117,7 @@ impl Votes {
             votes: sum.votes,
             vote_accuracy_pct: percent(sum.right_votes as f64, sum.votes),
             coverage_pct: percent(sum.standing as f64, standing),
-            // Silence is right where nothing stands.
+            // No vote is right for an empty location.
             accuracy_pct: percent(sum.right_items + (free - sum.free) as f64, all),
         };
         sums.into_iter()
@@ -135,14 +135,16 @@ struct Sum {
     free: u64,
 }
 
-/// The chance that one of the most frequent labels, drawn at random, is right; `None` without votes.
+/// The chance that one of the most frequent labels, drawn at random, is right; `None` without
+/// votes.
 fn chance(ballot: &Ballot) -> Option<f64> {
     let most = ballot.values().map(|said| said.votes).max()?;
     let first = ballot.values().filter(|said| said.votes == most);
     Some(first.clone().filter(|said| said.right).count() as f64 / first.count() as f64)
 }
 
-/// The location that an object is taken for: the one it names, or else the best by position.
+/// The location to which an object is assigned: the location that it names, otherwise the best one
+/// by position.
 pub(super) fn place<'a>(
     object: &PerceivedObject,
     landmarks: &'a LandmarkIndex,

@@ -19,8 +19,8 @@ const AT_THRESHOLD: [&str; 13] = [
     "fragments",
 ];
 
-/// Tables, each under its header: average precision of all and of every class, what holds at two thresholds, and the
-/// reliability of each stated probability.
+/// Tables, each under its header: average precision of all and of every class, figures at two
+/// thresholds, and the reliability of each stated probability.
 pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
     let distances = AP_DISTANCES_M.map(|distance| format!("AP@{distance} %"));
     let row =
@@ -130,7 +130,7 @@ fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<Str
         .collect()
 }
 
-/// A share in percent; a dash where there is none.
+/// A share in percent; a dash without a value.
 pub(crate) fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".into(), |share| format!("{share:.2}"))
 }

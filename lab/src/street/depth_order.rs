@@ -1,9 +1,10 @@
-//! Order in which things on the ground are painted, so that the nearer hides the farther.
+//! Painting order of objects on the ground, so that nearer objects hide farther ones.
 
 use nalgebra::Point2;
 
-/// Places of the footprints in the list, the farthest from the eye first. Corners are counter-clockwise. Footprints that overlap,
-/// and those that hide each other in a circle, are ordered by the distance of their middles.
+/// Places of the footprints in the list, the farthest from the eye first. Corners are
+/// counter-clockwise. Footprints that overlap, and footprints that hide each other in a circle, are
+/// ordered by the distance of their middles.
 pub(super) fn depth_order(eye: &Point2<f64>, footprints: &[[Point2<f64>; 4]]) -> Vec<usize> {
     let distance = |place: &usize| nalgebra::distance(eye, &middle(&footprints[*place]));
     let mut remaining: Vec<usize> = (0..footprints.len()).collect();
@@ -21,7 +22,8 @@ pub(super) fn depth_order(eye: &Point2<f64>, footprints: &[[Point2<f64>; 4]]) ->
     order
 }
 
-/// True if `a` may hide `b` and not the other way round: a side of one has the other wholly beyond it. `None` if they overlap.
+/// True if `a` may hide `b` and not the other way round: a side of one has the other wholly beyond
+/// it. `None` if they overlap.
 fn is_nearer(eye: &Point2<f64>, a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<bool> {
     let parted_by_a = parting_side(a, b).map(|side| !is_beyond(side, eye));
     parted_by_a.or_else(|| parting_side(b, a).map(|side| is_beyond(side, eye)))

@@ -1,5 +1,6 @@
-//! An animation of the street, as a self-contained SVG that plays in a page: the street from above with what the cell knows, and
-//! the pictures of the cameras with what each of them read.
+//! An animation of the street, as a self-contained SVG that plays in a page: the street from above
+//! with the cell's objects, and the pictures of the cameras with the placards that each of them
+//! read.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -23,10 +24,10 @@ use crate::drawing::{INK, page, round};
 use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, TrueObject};
 use crate::testbed::birdseye::VEHICLE_COLORS;
 
-/// A map and when a vehicle had it.
+/// A map and the time at which a vehicle had it.
 #[derive(Debug, Clone, Copy)]
 pub struct KnownMap<'a> {
-    /// When it came.
+    /// Time of receipt.
     pub known_at: Timestamp,
     /// The map.
     pub map: &'a GlobalMap,
@@ -42,15 +43,15 @@ pub struct Film<'a> {
     pub edge: NodeName,
     /// The maps that the first camera's node got, in order.
     pub maps: Vec<KnownMap<'a>>,
-    /// The maps that it would have made of its own reports, in order.
+    /// The maps that the node would have made from its own reports, in order.
     pub alone: Vec<KnownMap<'a>>,
     /// All reports.
     pub reports: Vec<&'a ObjectReport>,
     /// The pictures of each camera.
     pub pictures: &'a [Vec<KeptPicture>],
-    /// When the edge was killed.
+    /// Time at which the edge was killed.
     pub killed_at: Timestamp,
-    /// When it was started again.
+    /// Time at which it was restarted.
     pub restarted_at: Option<Timestamp>,
     /// First and last moment that may be shown.
     pub ends: [Timestamp; 2],
@@ -62,10 +63,10 @@ const AFTER: Duration = Duration::from_secs(6);
 /// Time between two moments of the drawing, and between two pictures.
 const STEP: Duration = Duration::from_millis(200);
 const PICTURE_STEP: Duration = Duration::from_millis(400);
-/// Age of a map from which on a node knows nothing.
+/// Age of a map from which on a node counts as having no objects.
 pub const FORGOTTEN: Duration = Duration::from_secs(1);
 const PX_PER_M: f64 = 22.0;
-/// Half of what is shown of the street, in metres.
+/// Half the size of the shown part of the street, in metres.
 const HALF_M: [f64; 2] = [20.5, 10.0];
 const TOP_PX: f64 = 56.0;
 const MARGIN_PX: f64 = 18.0;
@@ -166,7 +167,7 @@ impl FilmScene<'_> {
         )
     }
 
-    /// The leader, the fate of the edge, and the number of known objects.
+    /// The leader, the state of the edge, and the number of detected objects.
     fn title(&self, width: f64) -> Group {
         let film = self.film;
         let who = film
@@ -251,7 +252,7 @@ impl FilmScene<'_> {
         })
     }
 
-    /// Something that is shown from some moments to the next.
+    /// An element that is shown from some moments to the next.
     fn visible(&self, is_shown: impl Iterator<Item = bool>) -> Animate {
         let shown: Vec<bool> = is_shown.collect();
         let changes =
@@ -274,7 +275,7 @@ impl FilmScene<'_> {
             .set("repeatCount", "indefinite")
     }
 
-    /// Something that goes where it is at each moment, and turns if it has to.
+    /// An element that moves along poses, and turns with them if `turns`.
     fn moving(&self, what: Group, poses: &[Pose], turns: bool) -> Group {
         let same =
             |of: fn(&Pose, &Pose) -> bool| poses.windows(2).all(|pair| of(&pair[0], &pair[1]));
@@ -322,7 +323,7 @@ impl FilmScene<'_> {
         )
     }
 
-    /// Something true, pale: what is known of it is drawn over it.
+    /// A true object, in a pale colour, because detected objects are drawn over it.
     fn body(&self, body: &StreetBody) -> Group {
         let poses: Vec<Pose> = self
             .times
@@ -387,7 +388,8 @@ impl FilmScene<'_> {
         self.moving(Group::new().add(dot).add(name), &self.poses(camera), false)
     }
 
-    /// A ring for each object of the maps: of one colour where several told of it, of the node's where only one did.
+    /// A ring for each object of the maps: of one colour if several nodes reported it, of the
+    /// node's colour if only one did.
     fn known_objects(&self) -> Group {
         let moments = &self.times;
         let mut seen: BTreeMap<uuid::Uuid, Vec<Option<&FusedObject>>> = BTreeMap::new();
@@ -579,7 +581,7 @@ impl FilmScene<'_> {
 }
 
 impl Street {
-    /// The placards of what stands nearest to a place.
+    /// The placards of the body nearest to a place.
     fn placard_near(&self, place: &Point2<f64>, at_s: f64) -> Option<&Solid> {
         let worn = self
             .bodies
@@ -598,7 +600,7 @@ fn shown(map: &GlobalMap) -> impl Iterator<Item = &FusedObject> {
         .filter(|object| object.confidence >= DEFAULT_THRESHOLD)
 }
 
-/// The node that alone told of an object.
+/// The only node that reported an object, if there is just one.
 fn only_witness(object: &FusedObject) -> Option<&NodeName> {
     match object.contributors.as_slice() {
         [node] => Some(node),
@@ -622,7 +624,7 @@ fn rectangle(
         .set("fill", color)
 }
 
-/// All that is shown of the street.
+/// The outline of the shown part of the street.
 fn frame(color: &'static str) -> Rectangle {
     rectangle([0.0, 0.0], [2.0 * HALF_M[0], 2.0 * HALF_M[1]], color)
 }

@@ -24,14 +24,14 @@ use crate::testbed::camera::sensor::Sensor;
 /// Pictures a second.
 pub const FRAMES_PER_S: f64 = 5.0;
 
-/// Quality of the pictures that are sent and of those that are kept.
+/// Quality of the sent and kept pictures.
 const QUALITY: i32 = 90;
 const KEPT_QUALITY: i32 = 60;
 
 /// Width and height in pixels of the pictures that are kept.
 pub const KEPT_PX: [i32; 2] = [240, 180];
 
-/// A small JPEG of what a camera showed.
+/// A small JPEG of a camera's picture.
 #[derive(Debug, Clone)]
 pub struct KeptPicture {
     /// When it was taken.
@@ -70,18 +70,18 @@ impl Drop for EndOnDrop {
 }
 
 impl NetworkCamera {
-    /// Starts the camera; second zero of the street is `start`. Each camera takes its pictures at a phase of its own, a share of the
-    /// time between two.
+    /// Starts the camera; second zero of the street is `start`. Each camera takes its pictures at
+    /// its own phase, a share of the time between two pictures.
     ///
     /// # Errors
-    /// When no port is free, or a placard cannot be drawn.
+    /// Returns an error if no port is free, or a placard cannot be drawn.
     pub async fn start(
         street: &Arc<Street>,
         number: usize,
         start: Timestamp,
     ) -> anyhow::Result<Self> {
         let socket = TcpSocket::new_v4()?;
-        // A slow vehicle is to miss pictures, not to get old ones.
+        // A slow vehicle should miss pictures instead of getting old ones.
         socket.set_send_buffer_size(SEND_BUFFER)?;
         socket
             .bind((Ipv4Addr::LOCALHOST, 0).into())
@@ -124,10 +124,10 @@ impl NetworkCamera {
         format!("http://{}/video", self.address)
     }
 
-    /// Ends the camera and gives the pictures that it kept, in the order of time.
+    /// Ends the camera and returns the pictures that it kept, in the order of time.
     ///
     /// # Errors
-    /// When a picture could not be rendered.
+    /// Returns an error if a picture could not be rendered.
     pub async fn stop(self) -> anyhow::Result<Vec<KeptPicture>> {
         drop(self.end);
         self.thread
@@ -150,7 +150,8 @@ struct Shooting {
 }
 
 impl Shooting {
-    /// Each picture is rendered before its time and sent at its time, so that no vehicle takes the time of rendering for a delay.
+    /// Each picture is rendered before its time and sent at its time, so that no vehicle takes the
+    /// time of rendering for a delay.
     fn run(self, ended: &AtomicBool, kept: &Mutex<Vec<KeptPicture>>) -> anyhow::Result<()> {
         let camera: &StreetCamera = &self.street.cameras[self.number];
         let mut sensor = None;
@@ -211,7 +212,7 @@ async fn serve(listener: TcpListener, pictures: watch::Receiver<Jpeg>) {
     }
 }
 
-/// Sends each picture once it is there, whatever the client asks for.
+/// Sends each picture once it is available, independent of the client's request.
 async fn send(mut client: TcpStream, mut pictures: watch::Receiver<Jpeg>) -> std::io::Result<()> {
     client.set_nodelay(true)?;
     let mut request = [0; 1024];

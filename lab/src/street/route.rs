@@ -3,7 +3,8 @@
 use ecod::model::geometry::Pose;
 use nalgebra::Point2;
 
-/// Half of the chord in metres along which something on a loop is headed, so that it does not turn at once.
+/// Half of the chord in metres along which something on a loop is headed, so that it does not turn
+/// at once.
 const HALF_CHORD_M: f64 = 0.4;
 
 /// Where something is at every time.
@@ -13,7 +14,7 @@ pub(super) enum Route {
     Stands(Pose),
     /// Around a closed way at a constant speed.
     Loop {
-        /// The way's corners; the last is followed by the first.
+        /// The corners of the route; the first follows the last.
         corners: Vec<Point2<f64>>,
         /// Metres per second.
         speed_mps: f64,
@@ -27,8 +28,9 @@ impl Route {
         Self::Stands(Pose::new(x_m, y_m, heading_deg.to_radians()))
     }
 
-    /// Along a lane, around its end, back on the other lane and around: `half_m` is half of a lane, `radius_m` the distance of a
-    /// lane from the middle of the road. Counter-clockwise, from the west end of the south lane.
+    /// Along a lane, around its end, back on the other lane and around: `half_m` is half of a lane,
+    /// `radius_m` the distance of a lane from the middle of the road. Counter-clockwise, from the
+    /// west end of the south lane.
     pub(super) fn road(half_m: f64, radius_m: f64, speed_mps: f64, start_m: f64) -> Self {
         const TURN: u32 = 16;
         let turn = |x_m: f64, from_rad: f64| {
@@ -70,7 +72,7 @@ impl Route {
     }
 }
 
-/// The point of a closed way so many metres from its first corner.
+/// The point of a closed route at a distance in metres from its first corner.
 fn point(corners: &[Point2<f64>], along_m: f64) -> Point2<f64> {
     let sides = || corners.iter().zip(corners.iter().cycle().skip(1));
     let length_m: f64 = sides().map(|(from, to)| nalgebra::distance(from, to)).sum();

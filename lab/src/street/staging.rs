@@ -1,4 +1,5 @@
-//! The street of the demo: a road with a lane each way, parked vans that hide the pavement behind them, and four cameras.
+//! The street of the demo: a road with a lane each way, parked vans that hide the pavement behind
+//! them, and four cameras.
 //!
 //! ```text
 //!   houses ==================================================

@@ -11,13 +11,14 @@ use super::network_camera::FRAMES_PER_S;
 use super::view::StreetView;
 use super::{Street, StreetCamera};
 
-/// Frames of a video: as long as a car takes to come back, so that no car jumps when the video starts again.
+/// Frames of a video: as long as a car takes to come back, so that no car jumps when the video
+/// starts again.
 const FRAMES: u32 = 100;
 
-/// Writes what a camera sees as H.264.
+/// Writes a camera's pictures as H.264.
 ///
 /// # Errors
-/// When OpenCV has no encoder for it, or the file cannot be written.
+/// Returns an error if OpenCV has no encoder for it, or the file cannot be written.
 pub(crate) fn write(street: &Street, camera: &StreetCamera, file: &Path) -> anyhow::Result<()> {
     let (view, optics) = (StreetView::new(street)?, Street::optics());
     let size = Size::new(optics.width.cast_signed(), optics.height.cast_signed());

@@ -1,4 +1,5 @@
-//! Pictures of the street: everything is projected by the pinhole camera and painted from far to near.
+//! Pictures of the street: all bodies are projected by the pinhole camera and painted from far to
+//! near.
 
 use std::collections::BTreeMap;
 
@@ -47,7 +48,7 @@ impl StreetView {
     /// A view with all placards of the street.
     ///
     /// # Errors
-    /// When a label does not fit into a code, or OpenCV fails.
+    /// Returns an error if a label does not fit into a code, or OpenCV fails.
     pub(crate) fn new(street: &Street) -> anyhow::Result<Self> {
         let mut placards = BTreeMap::new();
         for label in street.bodies.iter().filter_map(|body| body.label.clone()) {
@@ -77,7 +78,7 @@ impl StreetView {
     /// The picture of a camera at a time in seconds, without noise: 8-bit BGR.
     ///
     /// # Errors
-    /// When OpenCV fails.
+    /// Returns an error if OpenCV fails.
     pub(crate) fn render(
         &self,
         street: &Street,
@@ -336,7 +337,8 @@ impl Canvas<'_> {
     }
 }
 
-/// The part of a polygon that is at least [`NEAR_M`] before the camera (Sutherland and Hodgman 1974).
+/// The part of a polygon that is at least [`NEAR_M`] before the camera (Sutherland and Hodgman
+/// 1974).
 fn clip(corners: &[Point3<f64>]) -> Vec<Point3<f64>> {
     let mut kept = Vec::with_capacity(corners.len() + 1);
     for (from, to) in corners.iter().zip(corners.iter().cycle().skip(1)) {

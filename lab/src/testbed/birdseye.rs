@@ -1,4 +1,4 @@
-//! A scene seen from above, as a picture: who watched from where, what they saw, and what was agreed.
+//! A scene seen from above, as a picture: the vehicles, their detections, and the agreed labels.
 
 mod sheet;
 #[cfg(test)]
@@ -18,11 +18,12 @@ use sheet::{METRES_PER_INCH, Sheet};
 
 /// Draws a scene as a self-contained SVG, in inches.
 ///
-/// `detections` are places in the world with the vehicle that saw them; those beyond the frame are not drawn but
-/// counted in the legend. Spots are judged as in [`super::score`].
+/// `detections` are places in the world with the vehicle that saw them; places outside the frame
+/// are not drawn but counted in the legend. Spots are evaluated as in [`super::score`].
 ///
 /// # Errors
-/// [`BirdseyeError`] when a detection is not from one of the scene's vehicles, or a place is not finite.
+/// Returns a [`BirdseyeError`] if a detection is not from one of the scene's vehicles, or a place
+/// is not finite.
 pub fn birdseye(
     testbed: &Testbed,
     scene: &Scene,
@@ -59,7 +60,7 @@ pub enum BirdseyeError {
     /// A fused place is not a number.
     #[error("the map has {landmark} at a place that is not finite")]
     Landmark {
-        /// The known location.
+        /// The landmark.
         landmark: LandmarkId,
     },
 }
@@ -117,7 +118,8 @@ impl MarkKind {
         }
     }
 
-    /// A sign around `(x, y)` that tells the judgement without its colour: ring, cross, dashed ring.
+    /// A mark around `(x, y)` that shows the result independent of its colour: ring, cross, dashed
+    /// ring.
     fn mark(self, x: f64, y: f64) -> Group {
         let ring = || {
             Circle::new()
@@ -142,7 +144,8 @@ impl MarkKind {
     }
 }
 
-/// Fill of each vehicle in turn: the colours of Okabe and Ito that are not kin to those of a [`MarkKind`].
+/// Fill of each vehicle in turn: colours of Okabe and Ito that differ clearly from the colours of a
+/// [`MarkKind`].
 pub(crate) const VEHICLE_COLORS: [&str; 5] =
     ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
 const FAINT: &str = "#8a8a8a";
@@ -228,7 +231,8 @@ impl BirdseyePicture<'_> {
         bodies.fold(group, Group::add)
     }
 
-    /// Cards in the scene: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick towards its front.
+    /// Cards in the scene: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick
+    /// towards its front.
     fn placards(&self) -> Group {
         let placard = |place: &Point2<f64>, facing_rad: f64, weight: f64| {
             let pose = Pose {
@@ -375,7 +379,8 @@ impl BirdseyePicture<'_> {
         group
     }
 
-    /// Truth and agreed label of every spot, in rows beside the lot, each led to its spot by a line.
+    /// Truth and agreed label of every spot, in rows next to the lot, each connected to its spot by
+    /// a line.
     fn table(&self) -> Group {
         let frame_left = self.sheet.left();
         let columns = [-268.0, -196.0, -100.0].map(|offset| frame_left + offset);

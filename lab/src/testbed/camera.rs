@@ -1,9 +1,10 @@
-//! The recorded parking lots brought back to sight: no images were recorded, so that each vehicle's view is rendered
-//! from the geometry and then disturbed as a small camera disturbs it.
+//! Rendered views of the recorded parking lots: no images were recorded, so each vehicle's view is
+//! rendered from the geometry and then disturbed like the image of a small camera.
 //!
-//! Assumed, as it was not recorded: the axis of a camera is level and as high as the middle of the codes, unless a mount
-//! is given; a code sits as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles
-//! hide nothing.
+//! The following was not recorded and is assumed: the axis of a camera is level and at the height
+//! of the middle of the codes, unless a mount is given; the distance of a code from the upper end
+//! of its card equals its distance from the sides; cards stand on the floor; and vehicles do not
+//! hide objects.
 
 mod render;
 pub(crate) mod sensor;
@@ -27,10 +28,10 @@ pub struct TestbedCamera {
 }
 
 impl TestbedCamera {
-    /// Renders what the vehicle's camera has before it.
+    /// Renders the view of the vehicle's camera.
     ///
     /// # Errors
-    /// [`RenderError`] when a placard's text does not fit into a code or OpenCV fails.
+    /// Returns a [`RenderError`] if a placard's text does not fit into a code or OpenCV fails.
     pub fn new(
         testbed: &Testbed,
         scene: &Scene,
@@ -40,10 +41,11 @@ impl TestbedCamera {
         Self::mounted(testbed, scene, cav, &Mount::default(), seed)
     }
 
-    /// Renders what a camera has before it whose height and tilt are those of `mount`; the vehicle's pose is that of its camera.
+    /// Renders the view of a camera with the height and tilt of `mount`; the vehicle's pose is used
+    /// as the camera's pose.
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// Returns the errors of [`Self::new`].
     pub fn mounted(
         testbed: &Testbed,
         scene: &Scene,
@@ -64,7 +66,7 @@ impl TestbedCamera {
     /// Frame number `index`, with vibration, blur, uneven light and noise: 8-bit BGR.
     ///
     /// # Errors
-    /// [`RenderError`] when OpenCV fails.
+    /// Returns a [`RenderError`] if OpenCV fails.
     pub fn frame(&self, index: u64) -> Result<Mat, RenderError> {
         self.sensor.expose(&self.still, index)
     }

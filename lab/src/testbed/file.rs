@@ -15,7 +15,8 @@ use serde_json::Value;
 use super::{Camera, Cav, Placard, RecordedRun, Scene, Spot, Testbed};
 
 const METRES_PER_INCH: f64 = 0.0254;
-/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
+/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is
+/// rendered.
 const MIN_INTERVAL_S: f64 = 1e-4;
 const MAX_INTERVAL_S: f64 = 3600.0;
 /// Most frames that are rendered for one submission.
@@ -32,7 +33,8 @@ pub enum TestbedError {
     /// A value is missing, of the wrong kind or out of range.
     #[error("{place}: `{key}` {reason}")]
     Value {
-        /// `scene file`, `recording`, or `scene` and its name or, if it has none, its number counted from 0.
+        /// `scene file`, `recording`, or `scene` and its name or, if it has no name, its number
+        /// counted from 0.
         place: String,
         /// Path of the key, such as `spots[2].truth`.
         key: String,
@@ -343,7 +345,7 @@ fn check_spots(fields: Vec<SpotFields>, place: &KeyPath) -> Result<Vec<Spot>, Te
             truth,
         });
     }
-    // Spots without a direction of their own face as the others do on average, or +x.
+    // Spots without their own direction face in the others' average direction, or +x.
     let facing_rad = mean
         .try_normalize(1e-9)
         .map_or(0.0, |mean| mean.y.atan2(mean.x));

@@ -14,11 +14,11 @@ use super::{Cav, Scene, Testbed};
 /// Frames that are rendered; they are played again and again.
 const FRAMES: u64 = 50;
 
-/// Renders the vehicle's first frames into `directory`, without loss. The returned source plays them at the rate of the
-/// scene's cameras.
+/// Renders the vehicle's first frames into `directory`, without loss. The returned source plays
+/// them at the rate of the scene's cameras.
 ///
 /// # Errors
-/// When a frame cannot be rendered or written.
+/// Returns an error if a frame cannot be rendered or written.
 pub fn render(
     testbed: &Testbed,
     scene: &Scene,

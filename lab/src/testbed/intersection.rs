@@ -1,8 +1,10 @@
-//! The paper's VOTE testbed: recorded detector output through the projector, the naming of locations and VOTE.
+//! The paper's VOTE testbed: recorded detector output processed by the projector, the naming of
+//! locations and VOTE.
 //!
-//! Sizes were not recorded. Those of the objects on the table follow from the boxes that read them right; people and
-//! furniture have their natural size, which puts what is seen of them behind the table where it belongs; of anything
-//! else only the bearing is trusted. Poses are taken to be as exact as the recorded bearings turn out.
+//! Sizes were not recorded. Sizes of the objects on the table follow from the boxes with their
+//! right label. People and furniture have their natural size, which places visible parts of them
+//! correctly behind the table. For all other labels only the bearing is used. The accuracy of poses
+//! is derived from the scatter of the recorded bearings.
 
 pub mod generate;
 
@@ -55,17 +57,19 @@ const SIZES: [(&str, f64, f64); 16] = [
     ("truck", 3.0, 0.3),
     ("tv", 0.5, 0.3),
 ];
-/// Height in metres of what has any other label, to find its bearing with.
+/// Height in metres of objects with any other label, for computing their bearing.
 const ANY_HEIGHT_M: f64 = 0.11;
-/// Which location an object of known size is taken for.
+/// Gate for assigning an object of listed size to a location.
 const GATE: LandmarkGate = LandmarkGate {
     radius_m: 0.5,
     sigmas: 3.0,
     floor_m: 0.02,
 };
-/// Greatest angle in radians between an object of unknown size and the location that it is taken for.
+/// Maximum angle in radians between an object of unknown size and the location to which it is
+/// assigned.
 const MAX_BESIDE_RAD: f64 = 0.15;
-/// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
+/// Factor by which the height of such an object may differ from [`ANY_HEIGHT_M`] if it stands at
+/// the location.
 const MAX_HEIGHT_FACTOR: f64 = 5.0;
 
 /// Result of a recording.
@@ -101,7 +105,7 @@ pub struct FrameLabel {
     pub frame: u64,
     /// The location.
     pub landmark: LandmarkId,
-    /// The verdict; null for none.
+    /// The verdict; null without a verdict.
     pub label: Option<Label>,
     /// True if it is among the accepted labels.
     pub right: bool,
@@ -110,7 +114,7 @@ pub struct FrameLabel {
 /// Runs a recording.
 ///
 /// # Errors
-/// When a report cannot be written or read back.
+/// Returns an error if a report cannot be written or read back.
 pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<IntersectionResult> {
     let reports = reports(recording);
     let (fused, scores) = fuse(recording, &reports, Algorithms::Vote, VoteMode::Weighted)?;
@@ -142,7 +146,7 @@ pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<Inte
 }
 
 impl IntersectionResult {
-    /// The mean of scenes with equally many verdicts; `None` of none.
+    /// The mean of scenes with equally many verdicts; `None` without scenes.
     pub fn mean(name: &str, scenes: &[Self]) -> Option<Self> {
         let first = scenes.first()?;
         let mean = |figure: &dyn Fn(&Self) -> f64| {
@@ -197,7 +201,7 @@ pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     reports
 }
 
-/// Takes every object of unknown size for the location that is least beside it.
+/// Assigns every object of unknown size to the location with the smallest angle to it.
 fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
     let Some(camera) = report.pose.map(Pose::from) else {
         return;
@@ -228,7 +232,7 @@ fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
 /// A report as a line of a recording that `replay` reads.
 ///
 /// # Errors
-/// When it cannot be written as JSON.
+/// Returns an error if it cannot be written as JSON.
 pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<String> {
     let mut line = serde_json::to_value(report)?;
     line["topic"] = json!(match kind {
@@ -238,7 +242,8 @@ pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<Strin
     serde_json::to_string(&line)
 }
 
-/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both, the maps are judged.
+/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both,
+/// the maps are judged.
 fn fuse(
     recording: &IntersectionRecording,
     reports: &[ObjectReport],
@@ -279,7 +284,7 @@ fn fuse(
     Ok((fused, scores))
 }
 
-/// Every frame counts by itself.
+/// Every frame counts separately.
 fn truth(recording: &IntersectionRecording) -> anyhow::Result<Truth> {
     let spans = |accepted: &[Label]| -> Vec<_> {
         (0..recording.frame_count())
@@ -333,7 +338,8 @@ fn captured_at(frame: usize) -> Timestamp {
     START + FRAME_INTERVAL * u32::try_from(frame).unwrap_or(u32::MAX)
 }
 
-/// A round closes with the last vehicle's report of a frame, at the latest within the time of the next.
+/// A round closes with the last vehicle's report of a frame, at the latest within the time of the
+/// next.
 fn fusion(algorithms: Algorithms, mode: VoteMode) -> FusionConfig {
     let mut vote = VoteConfig {
         mode,

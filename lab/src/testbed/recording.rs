@@ -1,5 +1,5 @@
-//! The intersection of the paper's VOTE testbed: what the vehicles' detectors said, frame by frame, and what stood
-//! there.
+//! The intersection of the paper's VOTE testbed: the detections of the vehicles, frame by frame,
+//! and the true objects.
 //!
 //! Files are in inches, degrees and shares of the image, and converted while being read.
 
@@ -21,7 +21,7 @@ const BOX_ORDER: &str = "y_min, x_min, y_max, x_max";
 /// Frames and boxes that a file may have, to bound memory.
 const MAX_BOXES: usize = 1_000_000;
 
-/// Known objects and the detections of the vehicles that watch them.
+/// The true objects, and the detections of the vehicles that watch them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IntersectionRecording {
     /// The camera of every vehicle.
@@ -34,14 +34,14 @@ pub struct IntersectionRecording {
     pub frames: Vec<Vec<Vec<Detection>>>,
 }
 
-/// An object whose place and nature are known.
+/// An object with its place and labels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownObject {
     /// Name of its location.
     pub id: LandmarkId,
     /// Where it stands, in metres.
     pub position: Point2<f64>,
-    /// Labels that are right; at least one, the last is the one that the others count as.
+    /// Labels that count as right; at least one. The other labels count as the last one.
     pub accepted: Vec<Label>,
 }
 
@@ -54,7 +54,8 @@ impl IntersectionRecording {
     /// Reads a recording.
     ///
     /// # Errors
-    /// [`TestbedError`] when the text is not JSON, or names the key and what is wrong with its value.
+    /// Returns a [`TestbedError`] if the text is not JSON; otherwise it names the key and the fault
+    /// of its value.
     pub fn from_json(text: &str) -> Result<Self, TestbedError> {
         let place = KeyPath("recording".into());
         let value: Value = serde_json::from_str(text).map_err(TestbedError::NotJson)?;
@@ -66,7 +67,7 @@ impl IntersectionRecording {
         self.frames.iter().map(Vec::len).max().unwrap_or(0)
     }
 
-    /// The objects as the known locations of VOTE, with accepted labels as synonyms of the last one.
+    /// The objects as landmarks of VOTE, with accepted labels as synonyms of the last one.
     pub fn landmarks(&self) -> Vec<Landmark> {
         self.objects.iter().map(KnownObject::landmark).collect()
     }

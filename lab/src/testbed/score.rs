@@ -8,7 +8,7 @@ use serde::{Serialize, Serializer};
 
 use crate::testbed::{Scene, Spot, Testbed};
 
-/// Right and judged spots, of all and of the occupied ones.
+/// Numbers of right and of evaluated spots, for all spots and for the occupied ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SpotScore {
     right: u64,
@@ -18,7 +18,7 @@ pub struct SpotScore {
 }
 
 impl SpotScore {
-    /// Judges every spot of a map; not knowing is wrong.
+    /// Evaluates every spot of a map; an undetermined spot counts as wrong.
     pub fn judge(&mut self, testbed: &Testbed, scene: &Scene, map: &GlobalMap) {
         for spot in &scene.spots {
             let state = map.landmarks.iter().find(|state| state.id == spot.id);
@@ -29,7 +29,8 @@ impl SpotScore {
         }
     }
 
-    /// Judges every spot by its verdict; without a label that is wrong, as nobody voted for the placard of a free spot.
+    /// Evaluates every spot by its verdict. A spot without a label counts as wrong, because there
+    /// were no votes for the placard of a free spot.
     pub fn judge_verdicts(&mut self, testbed: &Testbed, scene: &Scene, verdicts: &Verdicts) {
         for spot in &scene.spots {
             let verdict = verdicts
@@ -44,12 +45,12 @@ impl SpotScore {
         }
     }
 
-    /// Share of right spots in percent; zero when none was judged.
+    /// Share of right spots in percent; zero without evaluated spots.
     pub fn accuracy_pct(&self) -> f64 {
         percent(self.right, self.judged)
     }
 
-    /// Share of right spots among the occupied ones in percent; `None` when no spot is occupied.
+    /// Share of right spots among the occupied ones in percent; `None` without occupied spots.
     pub fn occupied_accuracy_pct(&self) -> Option<f64> {
         (self.judged_occupied > 0).then(|| percent(self.right_occupied, self.judged_occupied))
     }
@@ -64,9 +65,9 @@ impl SpotScore {
     }
 }
 
-/// True if a map's label of a spot is right; `None` when the map does not know. A plate must be read to the letter. A free
-/// spot must be said to be empty: by its placard's text, or without a placard by vehicles that looked and found
-/// nothing.
+/// True if a map's label of a spot is right; `None` if the map has no answer. A plate must be read
+/// exactly. A free spot must be reported as empty: by its placard's text or, without a placard, by
+/// vehicles that had it in view without a detection.
 pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) -> Option<bool> {
     match (&state.label, &spot.truth) {
         (Some(label), Some(truth)) => Some(label == truth),
@@ -86,18 +87,20 @@ pub struct SceneResult {
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,
-    /// Right spots in percent by VOTE alone; null where VOTE does not run.
+    /// Right spots in percent by VOTE alone; null if VOTE does not run.
     pub vote_accuracy_pct: Option<f64>,
-    /// Right spots in percent as PACE and VOTE agree on them; likewise.
+    /// Right spots in percent as PACE and VOTE agree on them; null if one of them does not run.
     pub answer_accuracy_pct: Option<f64>,
-    /// Right spots among the occupied ones in percent, fused; written as 100 when none is occupied, as none is wrong.
+    /// Right spots among the occupied ones in percent, fused; written as 100 without occupied
+    /// spots.
     #[serde(serialize_with = "hundred_if_none")]
     pub occupied_accuracy_pct: Option<f64>,
     /// Right spots in percent of every vehicle alone.
     pub single_cav_accuracy_pct: BTreeMap<NodeName, f64>,
     /// Right spots in percent of always guessing that a spot is empty.
     pub always_empty_pct: f64,
-    /// Mean fused accuracy recorded on the physical testbed in percent; null when there is no recording.
+    /// Mean fused accuracy recorded on the physical testbed in percent; null when there is no
+    /// recording.
     pub recorded_pace_accuracy_pct: Option<f64>,
     /// Mean accuracy of every vehicle alone recorded on the physical testbed in percent.
     pub recorded_single_cav_accuracy_pct: BTreeMap<NodeName, f64>,

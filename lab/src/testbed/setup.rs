@@ -28,15 +28,16 @@ use ecod_actors::transport::gossip::{MembershipConfig, MulticastConfig};
 
 use crate::testbed::{Cav, Placard, Scene, Testbed};
 
-/// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
+/// The paper's δ in metres, an inch and a quarter: less than half the least distance between
+/// neighbouring spots.
 const GATE_M: f64 = 0.032;
 
-/// For how many frames a report counts at the least, as far as [`MAX_AGE_S`] allows.
+/// Minimum number of frames for which a report counts, as far as [`MAX_AGE_S`] allows.
 const FRAMES_REMEMBERED: f64 = 3.0;
 /// The most seconds that a report may count.
 const MAX_AGE_S: f64 = 3600.0;
 
-/// The edge's configuration: role, known locations and fusion.
+/// The edge's configuration: role, landmarks and fusion.
 pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     NodeConfig {
         name: Some(unused_name(scene, "edge")),
@@ -90,7 +91,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
     }
 }
 
-/// A vehicle's way from detections to reports.
+/// A vehicle's processing from detections to reports.
 pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
     let gate = fusion(testbed).pace.gate();
     let vehicle_camera = VehicleCamera {
@@ -139,7 +140,7 @@ pub fn fusion(testbed: &Testbed) -> FusionConfig {
     }
 }
 
-/// Poses are known to two millimetres, corners to half a pixel.
+/// Poses are accurate to two millimetres, corners to half a pixel.
 fn projection(placard: &Placard) -> ProjectionConfig {
     ProjectionConfig {
         sizes: ObjectSizes {
@@ -154,7 +155,7 @@ fn projection(placard: &Placard) -> ProjectionConfig {
     }
 }
 
-/// A spot counts as looked at where a plate would be read in most frames.
+/// A spot counts as in view if a plate there would be read in most frames.
 fn view(placard: &Placard) -> ViewConfig {
     ViewConfig {
         target_width_m: Some(placard.qr_width_m),
@@ -165,8 +166,8 @@ fn view(placard: &Placard) -> ViewConfig {
     }
 }
 
-/// Configuration that all nodes of the cell share. They gossip on loopback, where they meet no other cell of this machine,
-/// and serve no page.
+/// Configuration that all nodes of the cell share. They gossip on loopback, apart from other cells
+/// of this machine, and serve no page.
 fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     let membership = MembershipConfig {
         bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),

@@ -1,5 +1,5 @@
-//! Views of cards, by the geometry: cards stand upright and the axis of the camera is level with their codes, so
-//! that one column of the image meets each card at one depth.
+//! Views of cards, by the geometry: cards stand upright and the axis of the camera is at the height
+//! of their codes, so that one column of the image hits each card at one depth.
 
 use ecod::model::geometry::{Pose, wrap_angle};
 use nalgebra::Vector2;
@@ -10,14 +10,14 @@ use super::{Card, Testbed};
 pub(super) const NEAR_M: f64 = 1e-3;
 /// Columns by which the shown part of a code is measured.
 const PROBES: u32 = 41;
-/// Least width of a code in the image at which it may be read: a bit more than a pixel for each of the 21 modules of
-/// the smallest code, which no sampling of fewer can tell apart.
+/// Minimum width in pixels of a legible code in the image: slightly more than a pixel for each of
+/// the 21 modules of the smallest code. With fewer pixels the modules cannot be distinguished.
 const LEGIBLE_PX: f64 = 25.0;
-/// Part of a code that must be shown: error correction level M restores 15 % of the code words, but a finder pattern
-/// that is cut is not restored.
+/// Part of a code that must be shown: error correction level M restores 15 % of the code words, but
+/// a finder pattern that is cut is not restored.
 const CLEAR: f64 = 0.9;
 
-/// Where a line of sight meets the plane of a card.
+/// Intersection of a line of sight with the plane of a card.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hit {
     /// Distance along the axis of the camera in metres.
@@ -29,8 +29,8 @@ pub struct Hit {
 }
 
 impl Card {
-    /// Where the line of sight through one column meets the card's plane; `slope` is the tangent of its bearing, left
-    /// positive. `None` behind the camera and along the plane.
+    /// Intersection of the line of sight through one column with the card's plane; `slope` is the
+    /// tangent of its bearing, left positive. `None` behind the camera and along the plane.
     pub fn hit(&self, camera: &Pose, slope: f64) -> Option<Hit> {
         let (sin, cos) = camera.heading_rad.sin_cos();
         let sight = Vector2::new(cos - sin * slope, sin + cos * slope);
@@ -46,7 +46,8 @@ impl Card {
         })
     }
 
-    /// The slope of the line of sight to a point of the card, `right_m` from its middle; `None` behind the camera.
+    /// The slope of the line of sight to a point of the card, `right_m` from its middle; `None`
+    /// behind the camera.
     fn slope(&self, camera: &Pose, right_m: f64) -> Option<f64> {
         let (sin, cos) = self.facing_rad.sin_cos();
         let point = self.position + Vector2::new(-sin, cos) * right_m;
@@ -60,7 +61,8 @@ impl Card {
 pub struct Sighting {
     /// Distance of the card in metres.
     pub range_m: f64,
-    /// Angle between the direction that the card faces and the line to the camera, 0 to π/2 radians.
+    /// Angle between the direction that the card faces and the line to the camera, 0 to π/2
+    /// radians.
     pub yaw_rad: f64,
     /// Width of the code in the image, in pixels.
     pub width_px: f64,
@@ -69,8 +71,8 @@ pub struct Sighting {
 }
 
 impl Sighting {
-    /// View of `card` among `cards` by the camera at `camera`; `None` unless the code lies fully inside the image and
-    /// shows its front.
+    /// View of `card` among `cards` by the camera at `camera`; `None` unless the code lies fully
+    /// inside the image and shows its front.
     pub fn of(card: &Card, cards: &[Card], camera: &Pose, testbed: &Testbed) -> Option<Self> {
         let (intrinsics, placard) = (&testbed.camera.intrinsics, &testbed.placard);
         let half_m = placard.qr_width_m / 2.0;

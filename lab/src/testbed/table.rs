@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::score::SceneResult;
 
-/// One line a scene: maps, shares of spots that are right, and spots that nobody sees.
+/// One line per scene: maps, shares of right spots, and spots that no camera sees.
 pub fn table(results: &[SceneResult]) -> String {
     let mut text = String::new();
     let header = [

@@ -9,7 +9,8 @@ const SETUPS: [&str; 2] = [
     include_str!("../../../examples/testbed/pace_setup2.json"),
 ];
 
-/// A camera at the origin that looks along +x at cards that face it; one inch is one unit of the file.
+/// A camera at the origin that looks along +x at cards that face it; one inch is one unit of the
+/// file.
 fn lot(spots: &Value) -> Value {
     json!({
         "camera": {"image_width": 640, "image_height": 480, "horizontal_fov_deg": 62.2, "vertical_fov_deg": 48.8},
@@ -231,8 +232,8 @@ fn a_parked_vehicle_hides_what_is_behind_it() {
         ]))[0]
     };
     assert!(!cover(0.0));
-    // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it begins at (y - 1.375) /
-    // 8.
+    // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it
+    // begins at (y - 1.375) / 8.
     assert!(!cover(1.6), "covers a quarter of the code");
     assert!(cover(2.1), "passes beside");
     let camera = Pose::new(0.0, 0.0, 0.0);

@@ -1,5 +1,5 @@
-//! A scene from its first frame to its last map, in virtual time: rendered, detected, projected and fused by the parts
-//! that a live node runs.
+//! A scene from its first frame to its last map, in virtual time: rendered, detected, projected and
+//! fused by the parts that a live node runs.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -38,10 +38,10 @@ pub struct Trial<'a> {
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
 impl Trial<'_> {
-    /// Runs the scene on all cores; `progress` is told of every frame seen.
+    /// Runs the scene on all cores; `progress` is called for every processed frame.
     ///
     /// # Errors
-    /// When a part of the pipeline cannot be built or a frame cannot be rendered.
+    /// Returns an error if a part of the pipeline cannot be built or a frame cannot be rendered.
     pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
         let reports = self.reports(&progress)?;
         let mut fused = self.aggregator(Algorithms::Pace);
@@ -90,7 +90,7 @@ impl Trial<'_> {
         })
     }
 
-    /// Fuses one verdict's reports and judges what comes of them.
+    /// Fuses one verdict's reports and evaluates the result.
     fn judge(
         &self,
         aggregator: &mut Aggregator,
@@ -182,7 +182,8 @@ impl Trial<'_> {
     }
 }
 
-/// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and returns the last round.
+/// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and
+/// returns the last round.
 fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<Fused> {
     reports.sort_by(|a, b| {
         a.captured_at_us

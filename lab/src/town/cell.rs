@@ -1,4 +1,4 @@
-//! One cell of a town: its aggregator, its neighbours, and the maps that came of it.
+//! One cell of a town: its aggregator, its neighbours, and its maps.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use uuid::Uuid;
 
 use super::place::CellFrame;
 
-/// A cell that leads itself.
+/// A cell that is always led by its own aggregator.
 pub(super) struct TownCell {
     frame: CellFrame,
     aggregator: Aggregator,

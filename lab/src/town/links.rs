@@ -1,4 +1,4 @@
-//! Links between the cells of a town, on which maps take their time.
+//! Links between the cells of a town, which delay maps.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use ecod::wire::{CellMap, RegionTopic};
 use super::LinkConfig;
 use super::cell::TownCell;
 
-/// Maps that are under way.
+/// Maps in transit.
 pub(super) struct TownLinks<'a> {
     config: LinkConfig,
     uniform: &'a mut dyn FnMut() -> f64,
@@ -19,7 +19,7 @@ pub(super) struct TownLinks<'a> {
     number: u64,
 }
 
-/// A map and the number of the cell that gets it.
+/// A map and the number of the receiving cell.
 struct MapUnderWay {
     to: usize,
     message: Arc<(RegionTopic, CellMap)>,

@@ -6,13 +6,13 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, ObjectReport};
 use nalgebra::{Isometry2, Point2, Vector2};
 
-/// A cell's frame and clock against those of the town.
+/// A cell's frame and clock relative to the town's.
 #[derive(Debug, Clone)]
 pub(super) struct CellFrame {
     pub(super) origin: GeographicOrigin,
-    /// From the town's frame into the cell's. Within a kilometre both planes are one to a millimetre.
+    /// From the town's frame into the cell's. Within a kilometre both planes agree to a millimetre.
     into: Isometry2<f64>,
-    /// The cell's clock less the town's.
+    /// The cell's clock minus the town's.
     clock_us: i64,
 }
 

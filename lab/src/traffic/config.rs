@@ -5,17 +5,18 @@ use std::f64::consts::TAU;
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-/// Parameters of the traffic and of its observers. The default is a quarter of a town with eight observers.
+/// Parameters of the traffic and of its observers. The default is a quarter of a town with eight
+/// observers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
-    /// Vehicles that report, of those that move. Default 8.
+    /// Number of reporting vehicles among the moving ones. Default 8.
     pub observers: usize,
     /// Vehicles that move, observers among them. Default 60.
     pub vehicles: usize,
     /// Vehicles that are parked. Default 40.
     pub parked: usize,
-    /// Parked vehicles that report, too, beside the `observers`. Default 0.
+    /// Number of parked vehicles that also report, in addition to the `observers`. Default 0.
     pub standing: usize,
     /// People on the pavements. Default 30; with 0 and no bicycles there is one class only.
     pub people: usize,
@@ -31,16 +32,18 @@ pub struct TrafficConfig {
     pub warm_up_s: f64,
     /// The observers drive one behind the other and on the same route. Default false.
     pub convoy: bool,
-    /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default false.
+    /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default
+    /// false.
     pub fixed: bool,
-    /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its
-    /// own, and reports take their time.
+    /// All observers capture at the same moments and reports arrive at once. Default false: each
+    /// observer has its own phase, and reports are delayed.
     pub synchronous: bool,
-    /// Seconds for which an object that nobody can see any more still belongs to the truth. Default 1.
+    /// Seconds for which an object that observers have lost from view still belongs to the truth.
+    /// Default 1.
     pub memory_s: f64,
     /// Sensors of the observers.
     pub sensor: SensorConfig,
-    /// Optional parts of reports, beside labels, confidences and positions.
+    /// Optional parts of reports, in addition to labels, confidences and positions.
     pub said: SaidConfig,
 }
 
@@ -58,27 +61,29 @@ pub struct SensorConfig {
     pub noise_m: f64,
     /// Addition to it for every metre of range. Default 0.005.
     pub noise_per_m: f64,
-    /// Standard deviation in metres of what an observer is wrong about one object for about a second. Default 0.15.
+    /// Standard deviation in metres of an observer's error about one object, which lasts for about
+    /// a second. Default 0.15.
     pub bias_m: f64,
     /// False alarms of one frame, on average per report. Default 0.8.
     pub clutter: f64,
-    /// False alarms that last, on average begun a second by each observer. Default 0.25.
+    /// Lasting false alarms, on average begun per second by each observer. Default 0.25.
     pub ghosts_per_s: f64,
-    /// Places a block that look like an object to all who pass. Default 0.7.
+    /// Places per block that look like an object to all passing vehicles. Default 0.7.
     pub lures: f64,
-    /// Standard deviation of an observer's own position in metres; changes within half a minute. Default 0.35.
+    /// Standard deviation of an observer's own position in metres; changes within half a minute.
+    /// Default 0.35.
     pub pose_m: f64,
     /// Standard deviation of its heading in radians. Default 0.01.
     pub pose_rad: f64,
     /// Time in seconds by which every second observer stamps its captures late. Default 0.
     pub stamped_late_s: f64,
-    /// Mean time in seconds that a report takes beyond 30 ms. Default 0.025.
+    /// Mean delay of a report in seconds beyond 30 ms. Default 0.025.
     pub latency_s: f64,
     /// Share of reports that are lost; as many come 0.2 to 0.5 s late. Default 0.01.
     pub lost: f64,
 }
 
-/// Optional parts of reports, beside labels, confidences and positions.
+/// Optional parts of reports, in addition to labels, confidences and positions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SaidConfig {
@@ -88,7 +93,8 @@ pub struct SaidConfig {
     pub covariances: bool,
     /// Area that their sensors cover; needs poses. Default true.
     pub views: bool,
-    /// Velocities, with such a standard deviation in metres per second in each direction; absent by default.
+    /// Velocities, with such a standard deviation in metres per second in each direction; absent by
+    /// default.
     pub velocities_mps: Option<f64>,
     /// Headings, with such a standard deviation in radians; absent by default.
     pub headings_rad: Option<f64>,
@@ -154,8 +160,8 @@ impl Default for SaidConfig {
 }
 
 impl TrafficConfig {
-    /// Like a recording of two vehicles with scanners on one route: cars only, captured together, no poses, no
-    /// covariances, some tens of metres of range.
+    /// Like a recording of two vehicles with scanners on one route: cars only, captured together,
+    /// no poses, no covariances, some tens of metres of range.
     pub fn two_vehicle_recording() -> Self {
         Self {
             observers: 2,
@@ -181,7 +187,8 @@ impl TrafficConfig {
         }
     }
 
-    /// Long roads about one block: observers pass others that are parked, one after the other, and go on reporting.
+    /// Long roads around one block: observers pass parked observers, one after the other, and
+    /// continue to report.
     pub fn much_passed() -> Self {
         Self {
             observers: 24,
@@ -200,7 +207,7 @@ impl TrafficConfig {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("roads", self.roads as f64, 2.0, 32.0)?;
         check_range("block_m", self.block_m, 50.0, 1000.0)?;

@@ -1,4 +1,4 @@
-//! Draws from distributions, out of a source of uniform numbers that is passed in.
+//! Draws from distributions, based on a source of uniform numbers.
 
 use std::f64::consts::TAU;
 
@@ -11,7 +11,7 @@ impl Dice<'_> {
         low + (high - low) * (self.0)()
     }
 
-    /// One of the first `count` whole numbers.
+    /// A random number from 0 to `count` − 1.
     pub(super) fn below(&mut self, count: usize) -> usize {
         ((self.0)() * count as f64) as usize
     }

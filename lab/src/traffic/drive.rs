@@ -1,7 +1,8 @@
 //! Vehicles that follow each other, stop at signals and turn.
 //!
-//! Speeds follow the Intelligent Driver Model (Treiber, Hennecke, Helbing, Phys. Rev. E 62, 2000). A vehicle enters a
-//! crossing if its signal is green, nobody crosses its way there, and there is room behind it.
+//! Speeds follow the Intelligent Driver Model (Treiber, Hennecke, Helbing, Phys. Rev. E 62, 2000).
+//! A vehicle enters a crossing if its signal is green, its path is free of crossing vehicles, and
+//! there is room behind the crossing.
 
 use super::dice::Dice;
 use super::roads::{Crossing, Direction, Path, Roads};
@@ -10,14 +11,14 @@ use super::roads::{Crossing, Direction, Path, Roads};
 const ACCELERATION: f64 = 1.8;
 const BRAKING: f64 = 2.5;
 const HARDEST_BRAKING: f64 = 7.0;
-/// Gap to the one in front, in metres at rest and in seconds.
+/// Gap to the preceding vehicle, in metres at rest and in seconds.
 const GAP_M: f64 = 2.0;
 const GAP_S: f64 = 1.2;
 /// Speed on a bend in m/s.
 const BEND_MPS: f64 = 6.0;
 /// Room in metres that the next lane must have.
 const ROOM_M: f64 = 8.0;
-/// Turns that a vehicle has in mind before it goes on with the first.
+/// Number of turns that a vehicle plans ahead.
 const ROUTE: usize = 64;
 
 #[derive(Debug, Clone)]
@@ -32,7 +33,8 @@ pub(super) struct MovingVehicle {
     crossed: usize,
 }
 
-/// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the other.
+/// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the
+/// other.
 pub(super) fn vehicles(
     roads: &Roads,
     count: usize,
@@ -67,7 +69,7 @@ pub(super) fn vehicles(
         let is_free = |other: &MovingVehicle| {
             other.path != vehicle.path || (other.along_m - vehicle.along_m).abs() > ROOM_M - 0.5
         };
-        // Places may run out at last; then vehicles stand closer, and the model parts them.
+        // If there are no more places, vehicles stand closer, and the model separates them.
         if vehicles.len() < convoy || vehicles.iter().all(is_free) || dice.chance(0.001) {
             vehicles.push(vehicle);
         }
@@ -156,7 +158,7 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
     ahead
 }
 
-/// True if nobody on the crossing is in the way, and there is room behind it.
+/// True if the crossing is free of vehicles in the way, and there is room behind it.
 fn is_free(
     vehicles: &[MovingVehicle],
     number: usize,
@@ -215,7 +217,8 @@ impl MovingVehicle {
         }
     }
 
-    /// True if another is on this one's way: behind the same stop line, wherever it turns to.
+    /// True if another vehicle's path begins like this one's: behind the same stop line,
+    /// independent of its turn.
     fn shares_beginning(&self, other: &Self, next: Path) -> bool {
         match (next, other.path) {
             (

@@ -1,10 +1,11 @@
-//! A square grid of roads with a lane each way, crossings with signals, and a building on every block.
+//! A square grid of roads with a lane each way, crossings with signals, and a building on every
+//! block.
 
 use nalgebra::{Point2, Vector2};
 
-/// From the middle of a road to that of a lane, in metres.
+/// Distance from the middle of a road to the middle of a lane, in metres.
 const LANE_M: f64 = 1.75;
-/// From the middle of a road to that of a parked vehicle.
+/// Distance from the middle of a road to a parked vehicle.
 const PARKED_M: f64 = 5.2;
 /// From the middles of both roads to a post.
 const POST_M: f64 = 9.0;
@@ -74,7 +75,6 @@ impl Roads {
         }
     }
 
-    /// All lanes.
     pub(super) fn lanes(&self) -> Vec<Path> {
         let crossings =
             (0..self.count).flat_map(|column| (0..self.count).map(move |row| (column, row)));
@@ -119,7 +119,7 @@ impl Roads {
         }
     }
 
-    /// Where a vehicle parks beside a lane.
+    /// Position and heading of a vehicle parked next to a lane.
     pub(super) fn parking(&self, path: Path, along_m: f64) -> (Point2<f64>, f64) {
         let (at, heading_rad) = self.place(path, along_m);
         let right = Vector2::new(heading_rad.sin(), -heading_rad.cos());
@@ -143,7 +143,8 @@ impl Roads {
         ]
     }
 
-    /// Position and heading in radians of a camera on a post: four look at each crossing, the middle one first.
+    /// Position and heading in radians of a camera on a post: four face each crossing, the middle
+    /// crossing first.
     pub(super) fn post(&self, number: usize) -> (Point2<f64>, f64) {
         let crossings = self.count * self.count;
         let crossing = (number / 4 + crossings / 2 + self.count / 2) % crossings;

@@ -1,4 +1,4 @@
-//! Lines of sight: vehicles and buildings hide what is behind them.
+//! Lines of sight: vehicles and buildings hide objects behind them.
 
 use ecod::model::geometry::wrap_angle;
 use nalgebra::{Point2, Vector2};
@@ -14,7 +14,7 @@ pub(super) struct TrafficBody {
     pub(super) speed_mps: f64,
     pub(super) length_m: f64,
     pub(super) width_m: f64,
-    /// True if it hides what is behind it.
+    /// True if it hides objects behind it.
     pub(super) is_opaque: bool,
 }
 
@@ -26,13 +26,14 @@ pub(super) struct Sight {
     pub(super) range_m: f64,
     /// World direction towards it.
     pub(super) bearing_rad: f64,
-    /// Share of its apparent width that nothing hides, 0 to 1.
+    /// Unhidden share of its apparent width, 0 to 1.
     pub(super) share: f64,
     /// Half its apparent width as an angle.
     half_rad: f64,
 }
 
-/// Bodies within `range_m` of a place, and how much of each is seen from there; the one at the place itself is not.
+/// Bodies within `range_m` of a place, and the visible share of each from there; the body at the
+/// place itself is left out.
 pub(super) fn sights(
     from: Point2<f64>,
     bodies: &[TrafficBody],
@@ -71,7 +72,7 @@ impl Sight {
         })
     }
 
-    /// Share of the angle that none of the others covers.
+    /// Share of the angle that the others leave uncovered.
     fn uncovered<'a>(&self, others: impl Iterator<Item = &'a Self>) -> f64 {
         let mut covers: Vec<(f64, f64)> = others
             .filter_map(|other| {
@@ -91,7 +92,7 @@ impl Sight {
     }
 }
 
-/// Share of three points across a body that no building hides.
+/// Share of three points across a body that buildings leave visible.
 fn past_buildings(from: Point2<f64>, sight: &Sight, buildings: &[Building]) -> f64 {
     let points = [-0.8, 0.0, 0.8].map(|share| {
         let (sin, cos) = (sight.bearing_rad + share * sight.half_rad).sin_cos();

@@ -1,9 +1,10 @@
 //! Sensor of one vehicle: from visible bodies to a report with errors.
 //!
-//! The chance of a detection depends on range, on how much of it is hidden, on its class, and on a quality of each
-//! pair of observer and object that changes within a second: misses come in runs. Confidences follow the same quality,
-//! so those of what is hardly seen look like those of what is not there. Of an object that is partly hidden, the middle
-//! of what is seen is reported.
+//! The chance of a detection depends on range, on how much of the object is hidden, on its class,
+//! and on a quality of each pair of observer and object that changes within a second, so that
+//! misses occur in runs. Confidences follow the same quality, so hardly visible objects have
+//! confidences like false alarms. For a partly hidden object, the middle of its visible part is
+//! reported.
 
 use ecod::model::geometry::{Covariance, Pose, wrap_angle};
 use ecod::wire::{FieldOfView, ObjectReport, PerceivedObject};
@@ -13,12 +14,12 @@ use super::config::{SaidConfig, TrafficConfig};
 use super::dice::{Dice, Drift};
 use super::sight::{Sight, TrafficBody};
 
-/// Correlation times in seconds of what an observer makes of an object, and of its pose error.
+/// Correlation times in seconds of an observer's view of an object, and of its pose error.
 const GLANCE_S: f64 = 0.8;
 const POSE_S: f64 = 25.0;
-/// Noise across the line of sight, as a share of that along it.
+/// Noise across the line of sight, as a share of the noise along it.
 const ACROSS: f64 = 0.6;
-/// Share that must be seen for anything to be found, and to count as seen.
+/// Share that must be visible for an object to be detected, and to count as seen.
 const MIN_SHARE: f64 = 0.15;
 /// Mean life of a ghost in seconds, and its chance to appear in a report.
 const GHOST_S: f64 = 1.5;
@@ -47,7 +48,7 @@ struct Glance {
     at_s: f64,
 }
 
-/// Something that is not there, and stays for a while.
+/// A false alarm that lasts for a while.
 #[derive(Debug, Clone, Copy)]
 struct Ghost {
     position: Point2<f64>,
@@ -225,7 +226,7 @@ impl SimulatedSensor {
         }
     }
 
-    /// Detection of a body that is there.
+    /// Detection of an existing body.
     fn glance(
         &mut self,
         config: &TrafficConfig,
@@ -268,7 +269,7 @@ impl SimulatedSensor {
         })
     }
 
-    /// Ends and begins what is not there.
+    /// Ends and begins lasting false alarms.
     fn haunt(
         &mut self,
         config: &TrafficConfig,
@@ -290,7 +291,7 @@ impl SimulatedSensor {
     }
 }
 
-/// Reported motion and size of an object, in a frame that is turned; a false alarm seems to stand.
+/// Reported motion and size of an object, in a rotated frame; a false alarm seems to stand.
 fn describe(
     said: &SaidConfig,
     object: &mut PerceivedObject,

@@ -1,4 +1,4 @@
-//! `ecod-region cell-account`: what a cell may do on its region's broker.
+//! `ecod-region cell-account`: the rights of a cell on its region's broker.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! `ecod-region export`: maps of a region in files of others.
+//! `ecod-region export`: maps of a region in other file formats.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -25,10 +25,11 @@ use crate::town::{Accepted, GeographicBounds};
 pub(super) struct ExportArguments {
     #[command(flatten)]
     broker: BrokerArguments,
-    /// Tile to be read, by its quadkey; without one all of the region
+    /// Tile to be read, by its quadkey. Default: the whole region
     #[arg(long, value_name = "QUADKEY", default_value = "")]
     tile: Quadkey,
-    /// Seconds to read, 2 at least: each cell's maps count after the first one. GeoJSON then has the latest of each cell, MCAP all
+    /// Seconds to read, at least 2, because each cell's maps count only after the first one.
+    /// GeoJSON then has the latest map of each cell, MCAP has all
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = clap::value_parser!(u64).range(2..))]
     seconds: u64,
     /// File to be written: NAME.geojson or NAME.mcap

@@ -22,10 +22,12 @@ pub(super) struct ServeArguments {
     /// Address and port of the page
     #[arg(long, value_name = "ADDRESS:PORT", default_value = DEFAULT_ADDRESS)]
     listen: SocketAddr,
-    /// File with the secret that gives access, at least 12 characters; an address that other machines reach needs it
+    /// File with the secret that gives access, at least 12 characters; required for an address that
+    /// other machines can reach
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Tile whose maps are always read, so that metrics tell of its silent cells; may be given several times
+    /// Tile whose maps are always read, so that metrics include its silent cells; may be given
+    /// several times
     #[arg(long, value_name = "QUADKEY")]
     watch: Vec<Quadkey>,
 }

@@ -14,7 +14,8 @@ pub struct FeatureCollection {
     pub features: Vec<Value>,
 }
 
-/// The cells within bounds and all their objects. Each feature has `kind`: `cell`, `tile` or `object`.
+/// The cells within bounds and all their objects. Each feature has `kind`: `cell`, `tile` or
+/// `object`.
 pub fn geojson(town: &RegionTown, bounds: &GeographicBounds, now: Timestamp) -> FeatureCollection {
     let TownView {
         cells,

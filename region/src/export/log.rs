@@ -1,4 +1,4 @@
-//! Maps of cells as they come, in a file of MCAP.
+//! Maps of cells in the order of arrival, in a file of MCAP.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -24,7 +24,7 @@ impl CellMapLog {
     /// An empty log.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub fn create(path: &Path) -> anyhow::Result<Self> {
         let file =
             File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
@@ -41,10 +41,10 @@ impl CellMapLog {
         })
     }
 
-    /// Writes a map that was received at `at`, whatever its encoding was.
+    /// Writes a map that was received at `at`, in any encoding.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if the file cannot be written.
     pub fn write(&mut self, topic: &str, payload: &[u8], at: Timestamp) -> anyhow::Result<()> {
         let Ok(map) = decode::<CellMap>(payload, &Limits::default()) else {
             return Ok(());
@@ -76,7 +76,7 @@ impl CellMapLog {
     /// Ends the file; returns the number of cells and of maps in it.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub fn finish(mut self) -> anyhow::Result<(usize, u64)> {
         self.writer.finish()?;
         Ok((

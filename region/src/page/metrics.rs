@@ -35,7 +35,7 @@ type RegionLabels = Vec<(&'static str, String)>;
 /// All metrics as text.
 ///
 /// # Errors
-/// Never for text; the encoder's writer may fail.
+/// Does not fail for text; the encoder's writer may fail.
 pub(super) fn metrics(
     state: &RegionState,
     page: &PageCounts,

@@ -32,9 +32,9 @@ pub(super) struct RegionApi {
 /// Answer to `/api/view`.
 #[derive(Debug, Serialize)]
 struct ViewAnswer {
-    /// True while the broker lets the reader in.
+    /// True while the reader is logged in at the broker.
     broker_up: bool,
-    /// The reason why it does not, or filters that it refuses.
+    /// The reason why it is not logged in, or the filters that the broker refuses.
     trouble: Option<String>,
     /// The reason why the maps of the view are not read.
     maps_withheld: Option<String>,
@@ -42,7 +42,7 @@ struct ViewAnswer {
     town: TownView,
 }
 
-/// Maximum number of tiles that a view asks for.
+/// Maximum number of tiles that a view requests.
 const MAX_TILES_OF_VIEW: usize = 16;
 
 /// Maximum length of a viewer's name.
@@ -66,10 +66,10 @@ impl RegionApi {
         }
     }
 
-    /// Asks for the tiles of all viewers, of whom one looks at `bounds` now.
+    /// Requests the tiles of all viewers, one of which now shows `bounds`.
     ///
     /// # Errors
-    /// The reason why its maps are not read.
+    /// Returns the reason why its maps are not read.
     pub(super) fn look(
         &self,
         viewer: &ViewerId,
@@ -81,7 +81,7 @@ impl RegionApi {
         self.ask(now).remove(viewer).map_or(Ok(()), Err)
     }
 
-    /// Asks for the tiles of all viewers; returns those whose maps are not read.
+    /// Requests the tiles of all viewers; returns the viewers whose maps are not read.
     pub(super) fn ask(&self, now: Timestamp) -> BTreeMap<ViewerId, MapsWithheld> {
         let mut viewers = self.viewers();
         let town = self.state.town();
@@ -97,7 +97,7 @@ impl RegionApi {
 
 type RegionRequest = State<Arc<RegionApi>>;
 
-/// All routes. Health needs no token, as the machines that ask hold no secrets.
+/// All routes. Health needs no token, because the monitoring systems that query it have no secrets.
 pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
     let counted = Arc::clone(api);
     let guard = PageGuard::new(access, move |refusal| {
@@ -116,7 +116,7 @@ pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
     with_headers(routes).with_state(Arc::clone(api))
 }
 
-/// Health: the broker lets the reader in and read.
+/// Health: the reader is logged in at the broker and may read.
 async fn show_health(State(api): RegionRequest) -> Response {
     let link = api.state.link();
     match link.trouble {
@@ -138,8 +138,9 @@ async fn show_metrics(State(api): RegionRequest) -> Response {
     }
 }
 
-/// The town within `?bounds=WEST,SOUTH,EAST,NORTH`, whose maps are read from now on; without bounds, all of it.
-/// `viewer=NAME` tells viewers of one host apart: each looks at one place.
+/// The town within `?bounds=WEST,SOUTH,EAST,NORTH`, whose maps are read from now on; without
+/// bounds, the whole town. `viewer=NAME` distinguishes viewers of one host: each viewer has one
+/// view.
 async fn show_view(
     State(api): RegionRequest,
     Extension(host): Extension<BrowserHost>,

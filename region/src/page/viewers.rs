@@ -1,7 +1,7 @@
-//! Views of the town: the tiles that somebody looks at, and whose maps are read.
+//! Views of the town: the tiles that viewers show, and whose maps are read.
 //!
-//! Addresses share views and cells evenly. One that has more views than another gives way to it, and the small views of each are
-//! read first.
+//! Addresses share views and cells evenly. A new view may replace a view of an address that has
+//! more views, and the small views of each address are read first.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
@@ -10,19 +10,19 @@ use std::time::Duration;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 
-/// Views that are looked at, and tiles that always are.
+/// Current views, and tiles that are always read.
 #[derive(Debug)]
 pub(super) struct Viewers {
     watched: Vec<Quadkey>,
     views: BTreeMap<ViewerId, TownWindow>,
 }
 
-/// A page, or a program, that looks at the town.
+/// A page or a program that shows the town.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct ViewerId {
     /// Its host's address, as hosts are counted.
     pub(super) host: IpAddr,
-    /// Its own name among those of the host.
+    /// Its own name among the viewers of the host.
     pub(super) name: String,
 }
 
@@ -30,7 +30,7 @@ pub(super) struct ViewerId {
 #[derive(Debug)]
 struct TownWindow {
     tiles: Vec<Quadkey>,
-    /// Number of cells in them, once they were counted after the last look.
+    /// Number of cells in the tiles, if counted since the last request.
     cells: Option<usize>,
     looked_at: Timestamp,
 }
@@ -46,7 +46,7 @@ pub(super) enum MapsWithheld {
     ManyViews,
 }
 
-/// Time for which a view is remembered. The page asks once a second.
+/// Time for which a view is kept. The page requests it once a second.
 const VIEW_LASTS: Duration = Duration::from_secs(10);
 
 /// Time after which a view is idle: it is the first to make room.
@@ -62,7 +62,7 @@ const MAX_CELLS_OF_VIEW: usize = 2000;
 const MAX_CELLS: usize = 10_000;
 
 impl MapsWithheld {
-    /// The reason for a person who looks.
+    /// The reason as text for a person.
     pub(super) fn in_words(self) -> String {
         match self {
             Self::LargeView => format!("zoom in: over {MAX_CELLS_OF_VIEW} cells in view"),
@@ -80,10 +80,10 @@ impl Viewers {
         }
     }
 
-    /// Notes that a viewer looks at tiles and no others.
+    /// Sets the tiles of a viewer.
     ///
     /// # Errors
-    /// [`MapsWithheld::ManyViews`]; nothing has changed then.
+    /// Returns [`MapsWithheld::ManyViews`]; the state is then unchanged.
     pub(super) fn look(
         &mut self,
         viewer: ViewerId,
@@ -107,7 +107,8 @@ impl Viewers {
         Ok(())
     }
 
-    /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with the most.
+    /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with
+    /// the most.
     fn replaced_by(&self, viewer: &ViewerId, now: Timestamp) -> Option<ViewerId> {
         let oldest = self.views.iter().min_by_key(|(_, view)| view.looked_at)?;
         if now.since(oldest.1.looked_at) >= IDLE_AFTER {
@@ -128,8 +129,8 @@ impl Viewers {
             .map(|(id, _)| id.clone())
     }
 
-    /// All tiles whose maps are to be read, without those that are in another, and the viewers whose maps are not;
-    /// `count` has the number of cells in tiles.
+    /// All tiles whose maps are to be read, without tiles that are inside another one, and the
+    /// viewers whose maps are not read; `count` returns the number of cells in tiles.
     pub(super) fn tiles(
         &mut self,
         count: impl Fn(&[Quadkey]) -> usize,
@@ -187,7 +188,7 @@ impl Viewers {
     }
 }
 
-/// True if a tile is one of these or in one.
+/// True if a tile is one of these or lies in one.
 fn is_within(tile: Quadkey, tiles: &BTreeSet<Quadkey>) -> bool {
     (0..=tile.digits()).any(|digits| tiles.contains(&tile.outer(digits)))
 }

@@ -83,7 +83,8 @@ impl GeographicBounds {
             && other.south < self.north
     }
 
-    /// The smallest tiles that cover the bounds, at most so many, none smaller than a cell's.
+    /// The smallest tiles that cover the bounds, at most `max` tiles, which are not smaller than a
+    /// cell's tile.
     pub fn tiles(&self, max: usize) -> Vec<Quadkey> {
         let mut tiles = vec![Quadkey::default()];
         tiles.retain(|tile| self.meets(&Self::of(*tile)));

@@ -21,14 +21,14 @@ impl ReadTiles {
         outer.min().copied()
     }
 
-    /// Reads these tiles and no others from `now` on. The time of those that are read already stays.
+    /// From `now` on reads exactly these tiles. Tiles that are already read keep their time.
     pub fn replace(&mut self, tiles: impl Iterator<Item = Quadkey>, now: Timestamp) {
         self.0 = tiles
             .map(|tile| (tile, self.since(tile).unwrap_or(now)))
             .collect();
     }
 
-    /// Reads none.
+    /// Stops reading all tiles.
     pub fn clear(&mut self) {
         self.0.clear();
     }

@@ -15,7 +15,7 @@ use super::{CellState, GeographicBounds, ReadTiles, RegionCell, RegionTown, Town
 /// The town within a view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TownView {
-    /// Bounds of the tiles of all known cells.
+    /// Bounds of the tiles of all cells.
     pub known: Option<GeographicBounds>,
     /// Numbers of the whole region.
     pub region: TownTotals,
@@ -25,9 +25,9 @@ pub struct TownView {
     pub has_maps: bool,
     /// Tiles with cells in the view, in one size.
     pub tiles: Vec<TileView>,
-    /// Cells in the view; none if there are more than `MAX_CELLS_SHOWN`.
+    /// Cells in the view; empty if there are more than `MAX_CELLS_SHOWN`.
     pub cells: Vec<TownCellView>,
-    /// Objects of live cells in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
+    /// Objects of live cells in the view; empty if there are more than `MAX_OBJECTS_SHOWN`.
     pub objects: Vec<ObjectView>,
 }
 
@@ -38,13 +38,13 @@ pub struct TownTotals {
     pub cells: usize,
     /// Cells whose newest map is not old.
     pub live: usize,
-    /// Cells that say that they lead, and whose maps are not read for long enough to know more.
+    /// Cells with a leader whose maps are not read for long enough for a conclusion.
     pub told: usize,
-    /// Cells that say that they lead, and of which no map comes.
+    /// Cells with a leader but without arriving maps.
     pub silent: usize,
-    /// Cells that say that they are offline.
+    /// Cells with the status offline.
     pub offline: usize,
-    /// Cells whose leader tells of troubles.
+    /// Cells whose leader reports troubles.
     pub troubled: usize,
     /// Objects of live cells.
     pub objects: usize,
@@ -52,7 +52,7 @@ pub struct TownTotals {
     pub vehicles: usize,
 }
 
-/// A tile and what is in it.
+/// A tile and its contents.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TileView {
     /// Its quadkey.
@@ -72,7 +72,7 @@ pub struct TownCellView {
     pub cell: NodeName,
     /// The quadkey of its tile.
     pub tile: String,
-    /// Latitude of its origin in degrees; of the middle of its tile while no map is known.
+    /// Latitude of its origin in degrees; before a map has arrived, of the middle of its tile.
     pub latitude_deg: f64,
     /// Longitude in degrees.
     pub longitude_deg: f64,
@@ -90,7 +90,7 @@ pub struct TownCellView {
     pub objects: usize,
     /// Vehicles in the map.
     pub vehicles: usize,
-    /// Troubles that its leader tells of.
+    /// Troubles that its leader reports.
     pub troubles: Vec<Trouble>,
     /// Version of its leader's software.
     pub version: Option<String>,
@@ -109,11 +109,11 @@ pub struct TownCellView {
 pub struct ObjectView {
     /// Its identity.
     pub id: Uuid,
-    /// The cell whose map has it.
+    /// The cell whose map contains the object.
     pub cell: NodeName,
     /// Its label.
     pub label: Label,
-    /// The probability that it is there.
+    /// The probability that the object exists.
     pub confidence: f64,
     /// Latitude in degrees.
     pub latitude_deg: f64,
@@ -125,13 +125,13 @@ pub struct ObjectView {
     pub vehicle: Option<NodeName>,
 }
 
-/// Maximum number of tiles of a view that are told apart.
+/// Maximum number of tiles of a view that are listed individually.
 const MAX_TILES_SHOWN: usize = 1024;
 
-/// Maximum number of cells of a view that are told one by one.
+/// Maximum number of cells of a view that are listed individually.
 pub(super) const MAX_CELLS_SHOWN: usize = 512;
 
-/// Maximum number of objects of a view that are told one by one.
+/// Maximum number of objects of a view that are listed individually.
 pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 
 impl RegionTown {
@@ -358,7 +358,7 @@ impl TownCellView {
     }
 }
 
-/// True if an announced address is one that browsers elsewhere can open.
+/// True if browsers on other machines can open an announced address.
 fn is_reachable(page: &str) -> bool {
     let ip = page
         .parse::<std::net::SocketAddr>()

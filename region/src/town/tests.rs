@@ -28,7 +28,8 @@ fn tile() -> Quadkey {
     Quadkey::of_cell(&PLACE)
 }
 
-/// A map of this round, sent at once, with an object so many metres to the east of the origin for each of these.
+/// A map of this round, sent at once, with objects at these distances in metres to the east of the
+/// origin.
 fn map(
     town: &mut RegionTown,
     cell: &'static str,
@@ -203,7 +204,7 @@ fn a_cell_is_silent_only_when_a_map_was_due() {
     ] {
         assert_eq!(state(&town, Some(60_000), ms), expected, "{ms} ms");
     }
-    // One that comes back is given the same time.
+    // A leader that comes back gets the same time.
     status(&mut town, "lot", 70_000, NodeState::Offline).unwrap();
     assert_eq!(state(&town, Some(60_000), 71_000), CellState::Offline);
     status(&mut town, "lot", 72_000, NodeState::Aggregating).unwrap();

@@ -147,8 +147,8 @@ fn a_vehicle_that_invents_parts_takes_nobody_elses_room() {
     );
 }
 
-/// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns which of them
-/// are admitted in order.
+/// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns
+/// which of them are admitted in order.
 fn admitted_around_a_wrong_stamp(wrong: u64, ahead_us: u64) -> Vec<bool> {
     let mut window = window();
     let admit = |n: u64| {
@@ -250,7 +250,8 @@ fn vehicles_are_bounded_and_silent_ones_make_room() {
     assert!(window.admit(&report("c", later), Timestamp(later)).is_ok());
 }
 
-/// Reports every 100 ms with 2 ms of transit, stamped `ahead_us(n)` ahead; returns how many were not admitted in order.
+/// Reports every 100 ms with 2 ms of transit, stamped `ahead_us(n)` ahead; returns how many were
+/// not admitted in order.
 fn lost(
     window: &mut ReportWindow,
     numbers: std::ops::Range<u64>,
@@ -387,7 +388,7 @@ fn vehicles_that_are_rejected_for_their_time_on_and_on_are_untimely() {
     let mut last = Timeliness::default();
     for n in 0..100 {
         heard(n, "good", 0);
-        // A clock that nobody can follow.
+        // A clock that jumps too much to be estimated.
         heard(n, "bad", n * 10_000_000);
         last = heard(n, "worse", n * 20_000_000);
     }

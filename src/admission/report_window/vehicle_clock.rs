@@ -1,4 +1,4 @@
-//! One vehicle's clock as far as it is known, and admission of the vehicle's reports by it.
+//! The estimated clock of one vehicle, and admission of the vehicle's reports by it.
 
 use std::collections::VecDeque;
 
@@ -16,22 +16,25 @@ pub(super) struct VehicleClock {
     pub(super) base: TimeBase,
     last_captured: Timestamp,
     last_seq: Option<u64>,
-    /// Capture time and `seq` of the latest admitted reports, ascending, at most [`MAX_REMEMBERED`].
+    /// Capture time and `seq` of the latest admitted reports, ascending, at most
+    /// [`MAX_REMEMBERED`].
     recent: VecDeque<(Timestamp, u64)>,
     pub(super) last_received: Timestamp,
     delay: MinimumDelay,
-    /// Capture time of the last report, if it was rejected for being too far ahead of all before.
+    /// Capture time of the last report, if it was rejected for being too far ahead of all earlier
+    /// reports.
     suspect: Option<Timestamp>,
     /// A clock that the rejected reports since the last admitted one agree on.
     pub(super) candidate: Option<LiveStream>,
     pub(super) last_heard: Timestamp,
-    /// Time since when reports are rejected for their time only.
+    /// Time since which reports have been rejected because of their time only.
     pub(super) untimely_since: Option<Timestamp>,
-    /// Grows while `seq` goes back and forth; a restart goes back once.
+    /// Increases while `seq` goes back and forth; a restart goes back only once.
     back_and_forth: u32,
-    /// Time since when none of its objects has an effect where it is.
+    /// Time since which all of the vehicle's objects have been where they have no effect.
     pub(super) misplaced_since: Option<Timestamp>,
-    /// Where it stands, if it states that it does not move, and when it last was elsewhere.
+    /// Position of a vehicle that states that it does not move, and the time when it last was
+    /// elsewhere.
     stood_at: Option<Point2<f64>>,
     pub(super) moved_at: Option<Timestamp>,
 }
@@ -56,25 +59,26 @@ pub(super) struct Bounds {
     pub(super) cell_offset: i64,
 }
 
-/// Measure of numbers that go back and forth from which two senders are behind them: some fourteen reports.
+/// Value of `back_and_forth` from which two senders are assumed to use the name: about fourteen
+/// reports.
 const MIN_BACK_AND_FORTH: u32 = 20;
 
 /// Distance in metres over which estimates of a standing sender's pose scatter.
 const MAX_STANDING_M: f64 = 25.0;
 
 impl Bounds {
-    /// Largest delay of a clock that is believed at once.
+    /// Largest delay of a clock that is accepted at once.
     fn reach(self) -> i64 {
         self.max_offset.saturating_add(self.max_age)
     }
 
-    /// Lead over all stamps before from which a stamp is doubted.
+    /// Lead over all earlier stamps above which a stamp is suspect.
     fn slack(self) -> i64 {
         self.max_age / 2
     }
 
-    /// Microseconds from a sender's clock to the aggregator's, given its least delay. A sender within the tolerance of
-    /// the cell's time keeps to that.
+    /// Microseconds from a sender's clock to the aggregator's, given its least delay. A sender
+    /// within the tolerance of the cell's time is treated as synchronised.
     fn to_aggregator(self, least: i64) -> i64 {
         let is_in_cell_time =
             least.saturating_add(self.cell_offset).saturating_abs() <= self.tolerance;
@@ -106,7 +110,7 @@ impl VehicleClock {
         }
     }
 
-    /// Notes where a sender is that states that it does not move.
+    /// Records the position of a sender that states that it does not move.
     pub(super) fn note_standing(&mut self, report: &ObjectReport, at: Timestamp) {
         let pose = report.pose.filter(|_| report.moving == Some(false));
         let place = pose.map(|pose| Point2::new(pose.x_m, pose.y_m));
@@ -116,12 +120,14 @@ impl VehicleClock {
         }
     }
 
-    /// True if two senders use the name: the numbers of the reports go back and forth, and their times do not.
+    /// True if two senders use the name: the numbers of the reports go back and forth, and their
+    /// times do not.
     pub(super) fn is_shared(&self) -> bool {
         self.back_and_forth >= MIN_BACK_AND_FORTH
     }
 
-    /// Admits a report by its own statement, by what is known of its sender's clock, or because its stream is live.
+    /// Admits a report by its stated clock error, by the estimate of its sender's clock, or because
+    /// its stream is live.
     pub(super) fn admit(
         &mut self,
         report: &ObjectReport,
@@ -158,7 +164,7 @@ impl VehicleClock {
         }
     }
 
-    /// Forgets the clock, because the next stamps are by another one.
+    /// Resets the clock estimate, because the next stamps are by another clock.
     fn start_over(&mut self, base: TimeBase, now: Timestamp) {
         *self = Self {
             base,
@@ -192,7 +198,7 @@ impl VehicleClock {
         Ok(Admitted::InOrder(captured_at))
     }
 
-    /// Admits a report by what is known of its sender's clock.
+    /// Admits a report by the estimate of its sender's clock.
     fn admit_by_own_clock(
         &mut self,
         report: &ObjectReport,
@@ -234,7 +240,8 @@ impl VehicleClock {
         Ok(Admitted::InOrder(captured.shifted(to_aggregator)))
     }
 
-    /// Admits a report that does not fit, if the stream that it belongs to is live: the sender's clock is another one.
+    /// Admits a report that contradicts the estimate if its stream is live: the sender's clock has
+    /// changed.
     fn admit_if_live(
         &mut self,
         report: &ObjectReport,
@@ -257,7 +264,7 @@ impl VehicleClock {
         (report.captured_at_us, Some(report.seq)) <= (self.last_captured, self.last_seq)
     }
 
-    /// Notes the vehicle's latest report.
+    /// Records the vehicle's latest report.
     fn advance(
         &mut self,
         report: &ObjectReport,
@@ -278,7 +285,8 @@ impl VehicleClock {
         Ok(())
     }
 
-    /// Remembers a report. It is rejected as a duplicate, also if it is older than all that are remembered.
+    /// Stores a report. A report that is a duplicate, or older than all stored reports, is
+    /// rejected.
     fn remember(&mut self, report: &ObjectReport) -> Result<(), RejectReason> {
         let entry = (report.captured_at_us, report.seq);
         let place = self.recent.partition_point(|known| *known < entry);
@@ -293,7 +301,7 @@ impl VehicleClock {
         Ok(())
     }
 
-    /// True if a delay fits the clock that is known.
+    /// True if a delay fits the estimated clock.
     fn is_known(&self, delay: i64, bounds: Bounds) -> bool {
         let least = self.delay.least();
         least != i64::MAX
@@ -309,7 +317,8 @@ impl VehicleClock {
             && delay.saturating_sub(least) > bounds.slack()
     }
 
-    /// True if the timestamp is too far ahead of all before, and the previous report does not confirm it.
+    /// True if the timestamp is too far ahead of all before, and the previous report does not
+    /// confirm it.
     fn is_suspect(&mut self, captured: Timestamp, delay_us: i64, slack_us: i64) -> bool {
         let before = self.suspect.take();
         let least = self.delay.least();

@@ -1,4 +1,4 @@
-//! What an aggregator publishes is accepted by every receiver, whatever valid reports it gets.
+//! Every receiver accepts all messages of an aggregator, for all valid reports.
 
 use proptest::collection::vec;
 use proptest::option;

@@ -1,4 +1,4 @@
-//! Other cells' word about vehicles, and the trust in their maps.
+//! Other cells' counts about vehicles, and the trust in their maps.
 
 use uuid::Uuid;
 

@@ -80,7 +80,8 @@ fn readings(fused: &Fused) -> Vec<(String, Vec<String>)> {
         .collect()
 }
 
-/// A vehicle at the side reads the sign behind a plate: that is no vote against the plate, and the vehicle is not wrong.
+/// A vehicle at the side reads the sign behind a plate: that is no vote against the plate, and the
+/// vehicle is not wrong.
 #[test]
 fn a_sign_behind_a_plate_is_no_vote_against_it() {
     let mut lot = Lot::new();
@@ -96,7 +97,7 @@ fn a_sign_behind_a_plate_is_no_vote_against_it() {
     assert!(lot.wrong("galileo") <= 1, "{:?}", lot.cell.reputations());
 }
 
-/// Maps are sent ten times a second: they say only once what all agree on.
+/// Maps are sent ten times a second, so a label on which all agree is stated only once.
 #[test]
 fn readings_are_told_where_they_differ_and_not_where_all_agree() {
     let names = ["euclid", "gauss", "galileo", "noether"];
@@ -164,7 +165,8 @@ fn a_sign_by_its_synonym_is_no_vote_either() {
     );
 }
 
-/// Map and verdict say the same, whoever was right before: when the car leaves, when another comes, and where two differ.
+/// Map and verdict give the same answer, independent of earlier reputation: when the car leaves,
+/// when another arrives, and when two vehicles differ.
 #[test]
 fn map_and_verdict_say_the_same() {
     let mut lot = Lot::new();

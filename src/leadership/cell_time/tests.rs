@@ -10,7 +10,7 @@ const SECOND_US: i64 = 1_000_000;
 /// From the true time back to 1970.
 const TO_1970_US: i64 = -1_794_000_000_000_000;
 
-/// Nodes that exchange messages with the leader as they do when nothing happens: idle beats and the answers to them.
+/// Nodes that exchange messages with the leader as in a quiet cell: idle beats and their answers.
 struct Cell {
     now: Timestamp,
     nodes: Vec<Node>,
@@ -23,7 +23,7 @@ struct Node {
     name: NodeName,
     role: Role,
     time: CellTime,
-    /// Its steady clock less the true time, and its wall clock less the true time.
+    /// The node's steady clock minus the true time, and its wall clock minus the true time.
     steady_us: i64,
     wall_us: i64,
     events: Vec<ClockEvent>,
@@ -64,7 +64,7 @@ impl Cell {
         }
     }
 
-    /// A transit of 1 to 4 ms, and seldom 300.
+    /// A transit time of 1 to 4 ms, and occasionally 300 ms.
     fn transit(&mut self) -> Duration {
         self.random = self
             .random
@@ -142,7 +142,7 @@ impl Cell {
         }
     }
 
-    /// The cell's time less the true time, as each node knows it.
+    /// Each node's estimate of the cell's time, minus the true time.
     fn errors(&self) -> Vec<i64> {
         self.nodes
             .iter()
@@ -181,7 +181,7 @@ fn all_agree_on_the_median_of_the_candidates_whatever_their_steady_clocks_say() 
         (Role::Cav, TO_1970_US, TO_1970_US),
         (Role::Cav, 0, -year),
     ]);
-    // It starts by the leader's own clock, and nobody has been heard yet.
+    // The cell starts with the leader's own clock, before any other node's messages arrive.
     cell.run(4);
     cell.all_know(3_000, 5_000);
 }
@@ -261,7 +261,8 @@ fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
     assert!(cell.nodes[1].events.is_empty());
 }
 
-/// A wrong clock costs nothing and is known by name, at its own node and at the leader; a vehicle's, too.
+/// A wrong clock does not affect the cell's time, and both its own node and the leader report it by
+/// name. This includes a vehicle's clock.
 #[test]
 fn clocks_that_are_off_are_known_by_name() {
     let mut cell = Cell::new(&[
@@ -327,8 +328,8 @@ fn clocks_that_are_off_are_known_by_name() {
     assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
 }
 
-/// A leader that nobody outvotes gives the cell its own wrong time; the others' clocks agree, and are not blamed. Of two
-/// clocks neither is blamed for certain.
+/// A leader with a wrong clock that is not outvoted imposes its time on the cell; the other clocks
+/// agree and are not reported. With two differing clocks, the report is uncertain for both.
 #[test]
 fn of_clocks_that_differ_the_ones_that_agree_are_right() {
     let wrong = |nodes: &[(Role, i64, i64)]| {

@@ -1,14 +1,14 @@
-//! A clock that stands still while its node is stalled.
+//! A clock that stops while its node is stalled.
 
 use std::time::Duration;
 
 use crate::model::time::Timestamp;
 
-/// Clock of the time during which the node was awake, driven by the `now` of its caller.
+/// Clock of the time during which the node was awake, driven by the caller's `now`.
 ///
-/// A node that was not scheduled, was suspended, or whose clock was set has not listened meanwhile; time that it did
-/// not listen is no silence of others. So time passes only up to the deadline that was planned plus a tolerance, and
-/// never backwards.
+/// A node that was not scheduled, was suspended, or whose clock was set could not receive messages
+/// in that time. It must not count this time toward a peer's timeout. The clock therefore advances
+/// at most to the planned deadline plus a tolerance, and never runs backwards.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct AwakeClock {
     outside: Timestamp,
@@ -17,7 +17,7 @@ pub struct AwakeClock {
 }
 
 impl AwakeClock {
-    /// A clock that starts at `now` and takes a delay of up to `tolerance` for time.
+    /// Creates a clock that starts at `now`. A delay of up to `tolerance` counts as elapsed time.
     pub fn new(now: Timestamp, tolerance: Duration) -> Self {
         Self {
             outside: now,
@@ -26,7 +26,8 @@ impl AwakeClock {
         }
     }
 
-    /// The time inside, after `now` outside, when the next thing was due at `due` inside.
+    /// Advances the clock and returns its time, given the caller's time `now` and the next deadline
+    /// `due` on this clock.
     pub fn advance(&mut self, now: Timestamp, due: Timestamp) -> Timestamp {
         let planned = due.since(self.inside) + self.tolerance;
         self.inside = self.inside + now.since(self.outside).min(planned);
@@ -34,12 +35,12 @@ impl AwakeClock {
         self.inside
     }
 
-    /// The time inside.
+    /// The time of this clock.
     pub fn now(&self) -> Timestamp {
         self.inside
     }
 
-    /// The time outside when it will be `due` inside.
+    /// The caller's time at which this clock will reach `due`.
     pub fn outside(&self, due: Timestamp) -> Timestamp {
         self.outside + due.since(self.inside)
     }

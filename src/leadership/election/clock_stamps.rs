@@ -15,15 +15,15 @@ pub struct ClockStamps {
     /// Time of sending, by the sender's steady clock.
     #[n(0)]
     pub sent_us: Timestamp,
-    /// The addressee's last message, if the sender has got one lately.
+    /// Stamps of the addressee's last message, if the sender received one recently.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(1)]
     pub answers: Option<AnsweredStamps>,
-    /// Time of sending, by the sender's wall clock; absent if that was never set.
+    /// Time of sending, by the sender's wall clock; absent if that clock was never set.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(2)]
     pub wall_us: Option<Timestamp>,
-    /// Time of sending in the cell's time, as far as the sender knows it.
+    /// Time of sending, by the sender's estimate of the cell's time.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(3)]
     pub cell_us: Option<Timestamp>,
@@ -34,10 +34,10 @@ pub struct ClockStamps {
     Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]
 pub struct AnsweredStamps {
-    /// Time of its sending, by its sender's steady clock.
+    /// Time at which that message was sent, by its sender's steady clock.
     #[n(0)]
     pub sent_us: Timestamp,
-    /// Time of its receipt, by its receiver's steady clock.
+    /// Time at which it was received, by its receiver's steady clock.
     #[n(1)]
     pub received_us: Timestamp,
 }

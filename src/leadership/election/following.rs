@@ -1,4 +1,4 @@
-//! Following a leader: its beats, others' evidence, and its loss.
+//! Following a leader: processing its beats and other nodes' evidence, and detecting its loss.
 
 use std::time::Duration;
 
@@ -17,6 +17,8 @@ impl Election {
         following.lost_at(&self.config).min(self.ask_at(following))
     }
 
+    /// Checks the deadlines of a follower: asks about a silent leader, and gives the leader up when
+    /// it counts as lost.
     pub(super) fn follow_timers(&mut self, now: Timestamp) {
         let State::Following(following) = &self.state else {
             return;
@@ -30,7 +32,8 @@ impl Election {
         }
     }
 
-    /// Asks about the leader. While just a round is late, which all followers may miss, those who know best are asked first.
+    /// Asks other nodes about the leader. If only one round is late, which may affect all
+    /// followers, this node first asks the leader itself and its successors.
     fn doubt(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else {
             return;
@@ -58,7 +61,7 @@ impl Election {
             .max(self.questions.last_at() + pause)
     }
 
-    /// Takes a leader's sign of life, or its claim.
+    /// Processes a leader's beat or claim.
     pub(super) fn take_beat(&mut self, beat: Beat, now: Timestamp) {
         if self.is_over(&beat.epoch) {
             self.send_status(&beat.epoch.leader, now);
@@ -90,7 +93,8 @@ impl Election {
                 }
             }
             State::Following(_) => self.send_status(&beat.epoch.leader, now),
-            // It is lower than what was followed last: that one is lost, and has to be outdone.
+            // The epoch is lower than the last followed epoch: the leader of that epoch is lost,
+            // and this claim has to be outbid.
             State::Seeking(_) => {
                 let over = self.epoch.clone().max(self.over.clone());
                 let no_login = self.no_login.clone();
@@ -99,10 +103,12 @@ impl Election {
         }
     }
 
-    /// Decides whether this node stops for another leader of a higher epoch. It stops for the one to which it has yielded, and
-    /// for one that outranks it, unless only this node has followers. It stops for one of its own rank unless that one has
-    /// fewer followers, and for one of a lower rank only if that one has more. Followers are counted by their own word.
-    /// Otherwise it goes on in a term above both.
+    /// Decides whether this node stops leading because of another leader's higher epoch. The node
+    /// stops for the node to which it has yielded, and for a leader of higher rank unless only this
+    /// node has followers. It stops for a leader of the same rank unless that leader has fewer
+    /// followers, and for a leader of lower rank only if that leader has more followers. The
+    /// follower count of each leader is the count that it states in its beats. If this node does
+    /// not stop, it continues in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else {
             return;
@@ -116,7 +122,8 @@ impl Election {
         let stays = if leading.has_yielded_to(&other) && beat.after.as_ref() == Some(&own) {
             false
         } else if !beat.hears_us {
-            // It does not hear us. An edge that nobody else hears either serves nobody; a vehicle serves itself.
+            // The other leader does not receive this node's messages. An edge without followers is
+            // of no use; a vehicle at least serves itself.
             followers > 0 || self.config.role != Role::Edge
         } else if self.outranks(&other, &self.id) {
             followers > 0 && beat.followers == 0 && beat.after.as_ref() < Some(&own)
@@ -132,7 +139,8 @@ impl Election {
         }
     }
 
-    /// True if `name` has a higher rank (role, priority) than `other`, and both are known. Certificates bound ranks.
+    /// True if `name` has a higher rank (role, priority) than `other` and the ranks of both are
+    /// available. Certificates limit ranks.
     fn outranks(&self, name: &NodeName, other: &NodeName) -> bool {
         let rank = |name: &NodeName| {
             let own = (*name == self.id).then(|| self.candidacy());
@@ -170,7 +178,8 @@ impl Election {
         self.send_status(&leader, now);
     }
 
-    /// Follows a leader that is known from others only; its own beat completes it.
+    /// Follows a leader that only other nodes have reported; the leader's first beat completes the
+    /// state.
     pub(super) fn adopt(&mut self, epoch: Epoch, heard_at: Timestamp, now: Timestamp) {
         let leader = epoch.leader.clone();
         self.epoch = Some(epoch.clone());
@@ -209,7 +218,7 @@ impl Election {
         self.send_status(&beat.epoch.leader, now);
     }
 
-    /// Learns what any message tells about leadership by its sender's epoch.
+    /// Derives changes of leadership from the sender's epoch, which every message contains.
     pub(super) fn hear_others(&mut self, message: &ElectionMessage, now: Timestamp) {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
@@ -224,7 +233,8 @@ impl Election {
                             && !self.is_over(next)
                     });
                     self.close(ended);
-                    // Followers of the old leader follow the one that it follows: none of them need claim.
+                    // Followers of the old leader follow the leader that it now follows, so that no
+                    // follower has to claim leadership.
                     match follows {
                         Some(next) => self.adopt(next, now, now),
                         None => self.lose_leader(now),
@@ -239,8 +249,10 @@ impl Election {
                             && other.leader != message.from
                             && other.leader != self.id =>
                     {
-                        // A leadership ends only on the word of more nodes than follow it, for a known candidate. Its own
-                        // followers have time to answer; until then the other leader has to speak for itself.
+                        // A leadership ends only if more nodes report another leader than follow
+                        // this one, and if the other leader is a known candidate. The node's own
+                        // followers get time to answer; until then only the other leader's own beat
+                        // counts.
                         let is_answered = now.since(leading.since) > self.config.response_timeout();
                         let has_more_followers = self.peers.followers(&other.leader, now)
                             > self.peers.followers(&self.id, now);
@@ -254,7 +266,8 @@ impl Election {
                         } else if self.peers.followers(&self.id, now) > 0 {
                             self.renew_later(&message.from, now);
                         }
-                        // A leader that its last follower has left outdoes nobody: the other one will speak for itself.
+                        // A leader without followers does not raise its term against the other
+                        // leader; it waits for that leader's own beat.
                     }
                     Some(other) if *other != own => {}
                     _ if message.term > own.term => self.renew_later(&message.from, now),
@@ -266,6 +279,8 @@ impl Election {
         }
     }
 
+    /// Processes another node's status: whether it refuses this node's leadership, which epoch it
+    /// reports as over, and at which brokers it cannot log in.
     pub(super) fn take_status(
         &mut self,
         from: &NodeName,
@@ -279,7 +294,8 @@ impl Election {
         {
             self.renew_later(from, now);
         }
-        // Of two that began to lead at the same time, one ends at once, and may have followers that hear it next in a while.
+        // If two nodes began to lead at the same time, one of them stops at once. It may have
+        // followers that do not receive the other leader's next beat for a while.
         let current = self.current_epoch().cloned();
         let is_corrected = self.peers.correct(from, &self.id, current.as_ref());
         if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.told) {
@@ -292,6 +308,8 @@ impl Election {
         }
     }
 
+    /// Closes the epoch that a leader has resigned from. A follower of that leader starts seeking
+    /// at once instead of waiting for the leader's timeout.
     pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
         if self.epoch.as_ref() == Some(epoch) {
             self.learn_round(&epoch.leader, last_round);
@@ -311,7 +329,8 @@ impl Election {
         }
     }
 
-    /// Doubts a leader that the membership gave up: it may hear less than the leader's beats and others tell.
+    /// Checks a leader that the membership gave up. The membership may have less information than
+    /// the leader's beats and other nodes' reports provide.
     pub(super) fn peer_down(&mut self, peer: &NodeName, now: Timestamp) {
         if let State::Following(following) = &mut self.state
             && following.epoch.leader == *peer
@@ -337,7 +356,8 @@ impl Election {
         }
     }
 
-    /// Follows the claimant to the lead if its claim is recent and this node does not outrank it, and seeks otherwise.
+    /// Called when the leader is lost. Follows the node that claims leadership if its claim is
+    /// recent and this node does not outrank it; otherwise starts seeking.
     fn lose_leader(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else {
             return;

@@ -1,8 +1,10 @@
-//! Handover of the lead, make before break: to a better candidate, or to the standby of a leader that most cannot reach.
+//! Handover of leadership, make before break: to a better candidate, or to the standby of a leader
+//! that most followers cannot reach.
 //!
-//! The old leader publishes until it hears that the new one leads. It yields right after a round, so that nearly a whole
-//! period is left for the few packets that this takes. The new leader goes on with the next round. If all of these packets
-//! are lost for a period, the old leader publishes that round too, and yields again after it.
+//! The old leader publishes until it receives the new leader's beat. It yields right after a round,
+//! so that almost a whole period remains for the few packets of the handover. The new leader
+//! publishes the next round. If all of these packets are lost for a period, the old leader
+//! publishes that round too, and yields again after it.
 
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::{Handover, Leading};
@@ -14,7 +16,7 @@ use crate::model::time::Timestamp;
 use crate::wire::Role;
 
 impl Election {
-    /// Starts a handover when a better candidate has been there long enough.
+    /// Starts a handover when a better candidate has been reachable and fit for `stable_ms`.
     pub(super) fn start_handover(&mut self, now: Timestamp) {
         let ours = self.candidacy().rank();
         if !matches!(&self.state, State::Leading(leading) if leading.handover.is_none()) {
@@ -45,7 +47,7 @@ impl Election {
         self.drive_handover(now);
     }
 
-    /// Repeats offers and yields, or gives the handover up.
+    /// Repeats offers and yields, or aborts the handover.
     pub(super) fn drive_handover(&mut self, now: Timestamp) {
         let limit = self.config.handover();
         let State::Leading(Leading {
@@ -73,7 +75,7 @@ impl Election {
         if now < handover.retry_at {
             return;
         }
-        // A cell that publishes no rounds has none to miss.
+        // A cell that publishes no rounds cannot miss one.
         handover.yielded |= handover
             .ready_at
             .is_some_and(|at| now.since(at) > self.config.roundless_yield());
@@ -87,6 +89,8 @@ impl Election {
         }
     }
 
+    /// Processes a challenger's answer that it is ready to lead. From now on the leader yields to
+    /// the challenger right after its next round.
     pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
         if let State::Leading(leading) = &mut self.state
             && let Some(handover) = leading
@@ -98,6 +102,9 @@ impl Election {
         }
     }
 
+    /// Records a round that this node published or accepted. A follower takes it as a sign of life
+    /// of the leader; a leader with a ready challenger yields now, because a round has just been
+    /// published.
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         if epoch.term <= self.term_limit(Role::Auto, now) {
             self.learn_term(epoch.term);
@@ -123,6 +130,10 @@ impl Election {
         }
     }
 
+    /// Processes the leader's offer to hand over. The first offer starts the preparation
+    /// ([`ElectionEffect::Prepare`]); when the preparation is complete, every further offer is
+    /// answered with `Ready`, because an earlier answer may have been lost. Offers of a node that
+    /// is not the followed leader are ignored.
     pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
         let may_lead = self.candidacy().may_lead();
         let State::Following(following) = &mut self.state else {
@@ -155,6 +166,8 @@ impl Election {
         }
     }
 
+    /// Takes over leadership after the old leader has yielded: the first own round is
+    /// `last_round + 1`.
     pub(super) fn take_yield(
         &mut self,
         from: &NodeName,

@@ -13,48 +13,55 @@ pub enum ElectionInput {
         /// The message.
         message: ElectionMessage,
     },
-    /// The membership found a node: it can be spoken to.
+    /// The membership found a node. Messages can be sent to it from now on.
     PeerAlive {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
-    /// The membership doubts a node: its leadership, if any, is checked at once.
+    /// The membership suspects a node. If that node is the leader, the election checks it at once.
     PeerSuspected {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
-    /// The membership gave a node up. The leader's own beats weigh more, see [`crate::leadership::election`].
+    /// The membership gave up a node. The leader's own beats have precedence, see
+    /// [`crate::leadership::election`].
     PeerDown {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
-    /// A node's process is gone for certain: its connection broke and its broker's port refuses a new one.
+    /// A node's process has certainly ended: its connection broke, and its broker's port refuses
+    /// new connections.
     PeerGone {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
-    /// The node's own parts changed, or its load did. Until first told, a node is not fit to lead.
+    /// The state of the node's own parts or its load changed. Until the first such input the node
+    /// is not fit to lead.
     Health {
         /// The state of the parts.
         health: Health,
     },
-    /// A round was published by this node, or accepted by its round filter.
+    /// This node published a round, or its round filter accepted one.
     Round {
-        /// The epoch it was published in.
+        /// The epoch in which it was published.
         epoch: Epoch,
         /// The round's number.
         round: u64,
     },
-    /// The candidates at whose brokers this node cannot log in, although it should, have changed.
+    /// The set of candidates at whose brokers this node should be logged in and cannot log in has
+    /// changed.
     NoLogin {
-        /// All of them, at most [`MAX_NO_LOGIN`](crate::leadership::election::MAX_NO_LOGIN).
+        /// All such candidates, at most
+        /// [`MAX_NO_LOGIN`](crate::leadership::election::MAX_NO_LOGIN).
         at: Vec<NodeName>,
     },
-    /// The preparation that [`ElectionEffect::Prepare`] asked for is complete.
+    /// The preparation requested by [`ElectionEffect::Prepare`] is complete.
     Prepared,
-    /// Others are to hear of this node at once: all of them from a node that may lead, from others the leader.
+    /// Announce this node to other nodes at once: a node that may lead announces itself to all
+    /// nodes, any other node to the leader.
     Greet,
-    /// The node is about to stop: a leader resigns, a follower tells its leader that it is no candidate any more.
+    /// The node is about to stop: a leader resigns, a follower informs its leader that it is not a
+    /// candidate any more.
     Leave,
 }
 
@@ -67,64 +74,70 @@ pub struct Health {
     pub fuser: bool,
     /// The gateway can publish and receive.
     pub gateway: bool,
-    /// Vehicles' reports are usable: not nearly all of them are rejected for their time.
+    /// Vehicles' reports are usable: the node does not reject nearly all of them because of their
+    /// timestamps.
     pub reports: bool,
-    /// The node uses the cell's description, or nobody leads.
+    /// The node uses the cell's description, or there is no leader.
     pub settings: bool,
     /// Processor load of the machine, 0 to 100 %.
     pub load_percent: u8,
 }
 
 impl Health {
-    /// All parts work.
+    /// True if all parts work.
     pub fn is_fit(&self) -> bool {
         self.broker && self.fuser && self.gateway && self.reports && self.settings
     }
 }
 
-/// Something to be done, in the order given.
+/// An action for the caller, to be carried out in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum ElectionEffect {
-    /// Hand a term to the disk; it may be lower than the last one. An [`ElectionEffect::Lead`] in it waits for the answer.
+    /// Write a term to disk; it may be lower than the previous one. An [`ElectionEffect::Lead`] in
+    /// this term waits for the disk's answer.
     PersistTerm {
-        /// To be given to [`crate::leadership::election::Election::new`] after a restart.
+        /// The term to pass to [`crate::leadership::election::Election::new`] after a restart.
         term: u64,
     },
-    /// Send a message once, without waiting.
+    /// Send a message once, without blocking.
     Send {
         /// The addressee.
         to: NodeName,
         /// The message.
         message: ElectionMessage,
     },
-    /// Publish from now on in this epoch. Comes again, with a new epoch, when a leader has to renew its own.
+    /// Publish in this epoch from now on. Repeated with a new epoch when a leader has to renew its
+    /// term.
     Lead {
         /// The node's leadership.
         epoch: Epoch,
         /// The number of the next round.
         first_round: u64,
-        /// Time at which it is due.
+        /// Time at which the first round is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole length: the next one is the other's unless it stays away for a whole period.
+    /// Let the current round last its full length. The next round belongs to the other node, unless
+    /// that node publishes no round for a whole period.
     HoldRound,
-    /// Publish nothing more in this epoch.
+    /// Stop publishing in this epoch.
     StopPublishing {
         /// The leadership that ended.
         epoch: Epoch,
     },
-    /// Get ready to lead: serve the broker, take the leader's state, warm the fuser; then tell [`ElectionInput::Prepared`].
+    /// Prepare to lead: serve the broker, copy the leader's state, warm up the fuser; then send
+    /// [`ElectionInput::Prepared`].
     Prepare {
-        /// The leader that hands over.
+        /// The leader that hands over leadership.
         leader: NodeName,
     },
-    /// Count a message of this node with a term, round or sequence number beyond what can have been reached. The number
-    /// has changed nothing.
+    /// Count a message of this node whose term, round or sequence number is higher than could have
+    /// been reached. The number was not applied.
     CountImplausible {
         /// The sender.
         from: NodeName,
     },
-    /// Share all evidence about vehicles with a node: the next leader, or the one that remains when two sides heal.
+    /// Share all evidence about vehicles with a node: with the next leader, or with the leader that
+    /// remains when a split heals.
     SendSnapshot {
         /// The addressee.
         to: NodeName,

@@ -1,8 +1,9 @@
-//! The clock of the present leader, as its signs of life show it at another node.
+//! The clock of the current leader, as estimated by another node from the leader's signs of life.
 //!
-//! A leader states in each beat how long it has led. So a node can date a sign of life that others pass on: as long after one
-//! that it received itself as the leader says. A node that passes on an old sign of life as a new one convinces nobody, and with
-//! certificates nobody but the leader can make one.
+//! Each beat states how long the leader has led. A node can therefore date a sign of life that
+//! other nodes pass on: it was sent as long after a directly received beat as the two stated times
+//! differ. Passing on an old sign of life as a new one has no effect, and with certificates only
+//! the leader can create one.
 
 use std::time::Duration;
 
@@ -18,19 +19,20 @@ pub(super) struct LeaderClock {
     began_at: Timestamp,
     /// Time of the last sign of life that was dated.
     observed_at: Timestamp,
-    /// The latest sign of life, and when it was received.
+    /// The latest sign of life and its time of receipt.
     latest: LifeSign,
     latest_received_at: Timestamp,
 }
 
-/// Two clocks drift apart by one part in so many at most.
+/// Reciprocal of the maximum relative drift between two clocks.
 const MAX_DRIFT: u32 = 1000;
 
-/// Time between two signs of life from which their distance shows a live leader, whose clock stood still before.
+/// Minimum time between two signs of life whose distance proves a live leader after its clock had
+/// stopped.
 const LIVE_TIME: Duration = Duration::from_millis(150);
 
 impl LeaderClock {
-    /// Clock of a leader by a beat that it has just sent.
+    /// Creates the clock from a beat that the leader has just sent.
     pub(super) fn of_beat(epoch: Epoch, life: LifeSign, now: Timestamp) -> Self {
         let began_at = now - Duration::from_millis(life.led_ms);
         Self {
@@ -42,19 +44,19 @@ impl LeaderClock {
         }
     }
 
-    /// Takes a beat that the leader has just sent.
+    /// Processes a beat that the leader has just sent.
     pub(super) fn beat(&mut self, life: LifeSign, now: Timestamp) {
         self.began_at = now - Duration::from_millis(life.led_ms);
         (self.observed_at, self.latest_received_at) = (now, now);
         self.latest = life;
     }
 
-    /// True if it is the clock of this leadership.
+    /// True if this is the clock of the leadership `epoch`.
     pub(super) fn is_of(&self, epoch: &Epoch) -> bool {
         self.epoch == *epoch
     }
 
-    /// Time at which the leader sent its latest sign of life, at most.
+    /// Latest possible time at which the leader sent its last sign of life.
     pub(super) fn latest_at(&self) -> Timestamp {
         self.began_at + Duration::from_millis(self.latest.led_ms)
     }
@@ -64,7 +66,8 @@ impl LeaderClock {
         &self.latest
     }
 
-    /// Takes a sign of life that another node passed on; returns when the leader sent it, at most.
+    /// Processes a sign of life that another node passed on; returns the latest possible time at
+    /// which the leader sent it.
     pub(super) fn observe(&mut self, life: LifeSign, now: Timestamp) -> Timestamp {
         let led = Duration::from_millis(life.led_ms);
         let passed_here = now.since(self.latest_received_at);
@@ -115,12 +118,12 @@ mod tests {
             ms(520),
             "signs of life go on"
         );
-        // The same one again and again, as new.
+        // The same sign of life is passed on repeatedly as a new one.
         for at in [600, 2000, 10_000] {
             assert!(clock.observe(led(5400), ms(at)) <= ms(530), "at {at} ms");
         }
         assert_eq!(clock.latest(), &led(5400));
-        // It cannot have been sent later than it came.
+        // It cannot have been sent after it was received.
         assert!(clock.observe(led(60_000), ms(10_001)) <= ms(10_001));
     }
 
@@ -128,7 +131,7 @@ mod tests {
     fn a_leader_that_stood_still_is_followed_again_once_its_signs_of_life_go_on() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
-        // Its process was suspended for two seconds, which its clock does not count.
+        // The leader's process was suspended for two seconds, which its clock does not count.
         assert!(clock.observe(led(5050), ms(2160)) < ms(160));
         assert!(
             clock.observe(led(5100), ms(2210)) < ms(210),

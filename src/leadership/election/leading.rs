@@ -1,4 +1,4 @@
-//! Leading: beats, successors, and the search for a better candidate.
+//! Leading: sending beats, choosing successors, and finding a better candidate.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
 
-/// A handover as the old leader sees it.
+/// State of a handover at the old leader.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Handover {
     pub(super) to: NodeName,
@@ -20,7 +20,7 @@ pub(super) struct Handover {
     pub(super) yielded: bool,
 }
 
-/// A node that leads.
+/// State of a node that leads.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Leading {
     pub(super) epoch: Epoch,
@@ -29,11 +29,12 @@ pub(super) struct Leading {
     pub(super) after: Option<Epoch>,
     /// The next leaders, the standby first.
     pub(super) successors: Vec<NodeName>,
-    /// The handover under way.
+    /// The handover in progress.
     pub(super) handover: Option<Handover>,
-    /// Minimum time in this epoch before it is renewed.
+    /// Minimum time in this epoch before its renewal.
     pause: Duration,
-    /// Time at which to lead on in a higher epoch, as some refuse this one.
+    /// Time at which this node continues in a higher epoch because some nodes refuse the current
+    /// one.
     renew_at: Option<Timestamp>,
     beat_at: Timestamp,
     beats: u64,
@@ -59,7 +60,8 @@ impl Leading {
         }
     }
 
-    /// Sets the pause of an epoch that renews another: each is twice as long as the one before, up to [`RENEWAL_PAUSE`].
+    /// Sets the pause of an epoch that renews another: each pause is twice as long as the previous
+    /// one, up to [`RENEWAL_PAUSE`].
     pub(super) fn renewed(&mut self, before: &Self, least: Duration) {
         let is_calm = self.since.since(before.since) > RENEWAL_PAUSE * 6;
         self.pause = if is_calm {
@@ -69,7 +71,8 @@ impl Leading {
         };
     }
 
-    /// The sign of life of this leader, unsigned. Beats that are sent at about the same time have the same.
+    /// The sign of life of this leader, unsigned. Beats sent at about the same time contain the
+    /// same sign of life.
     fn life_sign(&self, now: Timestamp) -> LifeSign {
         let led_ms = u64::try_from(now.since(self.since).as_millis()).unwrap_or(u64::MAX);
         LifeSign {
@@ -78,14 +81,14 @@ impl Leading {
         }
     }
 
-    /// True if this leader has said that the next round is another node's.
+    /// True if this leader has yielded the next round to another node.
     pub(super) fn is_yielding(&self) -> bool {
         self.handover
             .as_ref()
             .is_some_and(|handover| handover.yielded)
     }
 
-    /// True if this leader has said to a node that the next round is that node's.
+    /// True if this leader has yielded the next round to the node `name`.
     pub(super) fn has_yielded_to(&self, name: &NodeName) -> bool {
         self.handover
             .as_ref()
@@ -137,8 +140,9 @@ impl Election {
         }
     }
 
-    /// Plans to lead on in a term that a peer cannot refuse: it knows a later term, or believes this epoch to have ended.
-    /// A newer leader that is just taking over is heard before.
+    /// Schedules a renewal in a term that the peer cannot refuse, because the peer has seen a later
+    /// term or regards this epoch as over. A newer leader that is just taking over has time to
+    /// announce itself first.
     pub(super) fn renew_later(&mut self, refused_by: &NodeName, now: Timestamp) {
         self.peers.note_refusal(refused_by, true);
         let at = now + self.config.given_up_timeout();
@@ -149,7 +153,8 @@ impl Election {
         }
     }
 
-    /// Plans to outdo a rival, and asks all whom they follow: this node may have been held up, and they may have left it.
+    /// Schedules a term above the rival's, and asks all nodes which leader they follow: this node
+    /// may have been stalled, and its followers may have left it.
     pub(super) fn contest(&mut self, rival: &NodeName, now: Timestamp) {
         let (soon, is_followed) = (
             now + self.config.given_up_timeout(),
@@ -158,7 +163,8 @@ impl Election {
         let State::Leading(leading) = &mut self.state else {
             return;
         };
-        // The pause is for single nodes that refuse. A rival that others follow is none of them.
+        // The pause applies to single nodes that refuse the epoch. A rival with followers is a
+        // different case.
         if leading.renew_at.is_none_or(|at| is_followed && at > soon) {
             leading.renew_at = is_followed.then_some(soon);
             self.renew_later(rival, now);
@@ -187,7 +193,8 @@ impl Election {
         self.send(to, body, now);
     }
 
-    /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
+    /// Time between two beats to a peer. A better candidate that is not yet fit gets beats more
+    /// often, so that the leader notices soon when it becomes fit.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
         let outranks = |candidacy: Candidacy| {
             candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank()
@@ -208,7 +215,7 @@ impl Election {
         }
     }
 
-    /// Chooses the successors, and tells all when they changed.
+    /// Chooses the successors and sends a beat to all nodes if they changed.
     pub(super) fn name_successors(&mut self, now: Timestamp) {
         if !self.is_leading() {
             return;

@@ -2,21 +2,25 @@
 //!
 //! # Deadlines
 //!
-//! While a leader is silent, three points in time pass in this order. Each is the earliest of several signs.
+//! While a leader is silent, three deadlines pass in this order. Each is the earliest of several
+//! conditions.
 //!
 //! | deadline | without rounds | with regular rounds | given up by the membership | then |
 //! |---|---|---|---|---|
 //! | [`Following::suspect_at`] | 2 beats | 1.5 round intervals | at once | asks about it |
 //! | [`Following::direct_timeout_at`] | `silence_beats` beats | 2.5 round intervals | `given_up_timeout` | asks less often |
-//! | [`Following::lost_at`] | the same | the same | the same | loses the leader, unless others heard it later |
+//! | [`Following::lost_at`] | `silence_beats` beats | 2.5 round intervals | `given_up_timeout` | loses the leader, unless other nodes received a later sign of life |
 //!
-//! A claim to lead by another node counts like the membership's word: the leader is asked about at once, and lost after
-//! `given_up_timeout` without a sign of life.
+//! Another node's claim to lead has the same effect as a report of the membership: this node asks
+//! about the leader at once, and the leader is lost after `given_up_timeout` without a sign of
+//! life.
 //!
-//! [`Following::silent_at`], two beats, says whom the first question goes to: before it to the leader and its successors,
-//! as one late round may be missing at all nodes; after it to all. Later questions go to all.
+//! [`Following::silent_at`] (two beats) selects the addressees of the first question: before it,
+//! the leader and its successors, because a late round may be missing at all nodes; after it, all
+//! nodes. Later questions go to all nodes.
 //!
-//! A leader that no longer hears this node counts as silent, too: [`Following::bidirectional_at`] bounds all of them.
+//! A leader that does not receive this node's messages also counts as silent:
+//! [`Following::bidirectional_at`] limits all three deadlines.
 
 use std::time::Duration;
 
@@ -28,34 +32,35 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// A node that follows a leader, by its beats or by others' evidence.
+/// State of a node that follows a leader, based on its beats or on other nodes' evidence.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Following {
     pub(super) epoch: Epoch,
     pub(super) successors: Vec<NodeName>,
     /// Time between two beats of the leader to this node.
     pub(super) beat_interval: Duration,
-    /// Time of its last accepted round.
+    /// Time of the leader's last accepted round.
     round_at: Option<Timestamp>,
-    /// Number of short gaps between its first rounds; they say nothing about the interval.
+    /// Number of short gaps between the leader's first rounds, which are not representative of the
+    /// interval.
     early_gaps: usize,
-    /// Time between two of its rounds, as long as they come.
+    /// Time between two of the leader's rounds while they arrive regularly.
     round_interval: Option<Duration>,
-    /// Time at which this node heard the leader.
+    /// Time at which this node last received a message of the leader.
     pub(super) direct_at: Timestamp,
-    /// True if a beat of this leadership was heard. Rounds, and the word of other nodes, may overtake messages that the
-    /// leader sent before it led.
+    /// True if a beat of this leadership was received. Rounds and reports of other nodes may
+    /// overtake messages that the leader sent before it led.
     pub(super) has_beaten: bool,
-    /// Time at which the leader said that it hears this node.
+    /// Time of the leader's last message that confirmed that it receives this node.
     pub(super) bidirectional_at: Timestamp,
-    /// Time at which others heard the leader, at least.
+    /// Earliest possible time at which other nodes last received the leader.
     pub(super) indirect_heard_at: Timestamp,
-    /// True if the membership gave the leader up since it was last heard.
+    /// True if the membership gave up the leader since its last sign of life.
     pub(super) given_up: bool,
-    /// Latest claim to lead by another node, with the time of the first one since the leader was last heard. It is followed
-    /// if the leader is lost.
+    /// Latest claim to lead by another node, with the time of the first such claim since the
+    /// leader's last sign of life. This node follows the claim if the leader is lost.
     pub(super) claim: Option<Box<(Timestamp, Beat)>>,
-    /// Time of the first question about it since it was last heard.
+    /// Time of the first question about the leader since its last sign of life.
     pub(super) asked_at: Option<Timestamp>,
     /// Time of the leader's last offer of the lead.
     pub(super) offered_at: Option<Timestamp>,
@@ -64,7 +69,8 @@ pub(super) struct Following {
 }
 
 impl Following {
-    /// A leader that was heard `direct_at`, or of which others said so at `indirect_heard_at`.
+    /// Creates the state for a leader whose message this node received at `direct_at`, or other
+    /// nodes received at `indirect_heard_at`.
     pub(super) fn new(
         epoch: Epoch,
         successors: Vec<NodeName>,
@@ -91,12 +97,12 @@ impl Following {
         }
     }
 
-    /// Time at which the leader was last alive for certain.
+    /// Latest time at which the leader was certainly alive.
     pub(super) fn evidence_at(&self) -> Timestamp {
         self.direct_at.max(self.indirect_heard_at)
     }
 
-    /// Notes that the leader, or a round of it, was heard.
+    /// Records a message or round of the leader.
     pub(super) fn hear(&mut self, now: Timestamp) {
         self.direct_at = now;
         self.given_up = false;
@@ -104,7 +110,8 @@ impl Following {
         self.asked_at = None;
     }
 
-    /// Notes an accepted round. The interval follows slower rounds at once and faster ones in time.
+    /// Records an accepted round. The interval adapts to slower rounds at once and to faster rounds
+    /// gradually.
     pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
         if let Some(last) = self.round_at.replace(now) {
             let gap = now.since(last);
@@ -118,7 +125,7 @@ impl Following {
         self.hear(now);
     }
 
-    /// Forgets the interval of rounds that no longer come.
+    /// Removes the round interval when rounds have stopped arriving.
     pub(super) fn forget_round_interval(&mut self, now: Timestamp) {
         self.round_interval.take_if(|gap| {
             self.round_at
@@ -126,7 +133,7 @@ impl Following {
         });
     }
 
-    /// First deadline: the leader is doubted.
+    /// First deadline: the leader is suspected.
     pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
         let late_at = self
             .telling_interval()
@@ -138,7 +145,7 @@ impl Following {
             .fold(self.silent_at(config), Timestamp::min)
     }
 
-    /// Time from when on more than a round is missing.
+    /// Time from which on more than one round is missing.
     pub(super) fn silent_at(&self, config: &ElectionConfig) -> Timestamp {
         if self.given_up {
             return self.direct_at;
@@ -147,7 +154,7 @@ impl Following {
         (self.direct_at + beats).min(self.bidirectional_at + beats.max(config.given_up_timeout()))
     }
 
-    /// Second deadline: this node's own hearing no longer counts.
+    /// Second deadline: this node's direct connection to the leader counts as broken.
     pub(super) fn direct_timeout_at(&self, config: &ElectionConfig) -> Timestamp {
         let silence = self.beat_interval * config.silence_beats;
         let unheard_at = self.bidirectional_at + silence.max(config.response_timeout());
@@ -170,9 +177,10 @@ impl Following {
 
     /// Third deadline: the leader is lost.
     ///
-    /// Others that heard the leader well after this node prove the link broken, not the leader. The same holds if they heard
-    /// it well after the beat that should have said that it hears this node. Then their evidence is enough, and may be as
-    /// old as the leader's slowest beat makes it.
+    /// If other nodes received the leader well after this node did, the link is broken and the
+    /// leader is alive. The same is true if they received it well after the beat that should have
+    /// confirmed this node's messages. In both cases the other nodes' evidence is sufficient, and
+    /// may be as old as the leader's slowest beat interval.
     pub(super) fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let direct_timeout_at = self.direct_timeout_at(config);
         let late = self.telling_interval().map(overdue);
@@ -185,14 +193,14 @@ impl Following {
         if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
             direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
         } else if late.is_some() {
-            // The standby, which hears more, gives the leader up first.
+            // The standby, which gets more beats, gives the leader up first.
             direct_timeout_at.max(self.indirect_heard_at + config.standby_silence())
         } else {
             direct_timeout_at
         }
     }
 
-    /// Time between two rounds, where they tell more than beats do.
+    /// Interval between two rounds, if rounds are more informative than beats.
     fn telling_interval(&self) -> Option<Duration> {
         self.round_interval.filter(|gap| *gap < self.beat_interval)
     }
@@ -251,11 +259,12 @@ mod tests {
             ms(0),
             Timestamp::default(),
         );
-        // A beat is due with the round: 50 ms after the last one, and a little late.
+        // A beat is due with the round: 50 ms after the previous beat, and slightly late.
         leader.take_round(config.beat(), ms(53));
         leader.indirect_heard_at = ms(52);
         assert_eq!(leader.lost_at(&config), ms(53) + config.standby_silence());
-        // Others that hear the leader when it no longer says that it hears this node prove the way to it broken.
+        // Other nodes receive the leader after it stopped confirming this node: the path to the
+        // leader is broken.
         leader.take_round(config.beat(), ms(90));
         leader.indirect_heard_at = ms(110);
         assert_eq!(leader.lost_at(&config), ms(110) + config.response_timeout());

@@ -1,8 +1,10 @@
-//! Logins at the brokers of candidates: a leader that most cannot reach makes way, and nobody is handed a lead in vain.
+//! Logins at the candidates' brokers: replaces a leader that most followers cannot reach, and
+//! ensures that the new leader's broker is reachable before a handover.
 //!
-//! Messages of the election pass where a broker may not be reached: by a firewall, or as its certificate is refused. Each
-//! node tells at which brokers of leader and standby it cannot log in. The leader draws the conclusions: followers need not
-//! agree, and a node alone moves no lead.
+//! Election messages can arrive where a broker is not reachable, for example because of a firewall
+//! or a refused certificate. Each node therefore reports at which brokers of leader and standby it
+//! cannot log in. Only the leader acts on these reports: followers need not agree, and one node's
+//! report is never enough to move leadership.
 
 use crate::leadership::election::message::MAX_SUCCESSORS;
 use crate::leadership::election::{Election, State};
@@ -10,13 +12,14 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
 impl Election {
-    /// Followers that cannot log in at this leader's broker, and all followers, by their own word.
+    /// Number of followers that report that they cannot log in at this leader's broker, and number
+    /// of all followers.
     pub fn followers_without_login(&self) -> (usize, usize) {
         self.peers
             .without_login(&self.id, &self.id, self.clock.now())
     }
 
-    /// Notes at which brokers this node cannot log in, and tells its leader.
+    /// Records at which brokers this node cannot log in, and reports them to its leader.
     pub(super) fn set_no_login(&mut self, at: Vec<NodeName>, now: Timestamp) {
         self.no_login = at;
         match &self.state {
@@ -29,7 +32,8 @@ impl Election {
         }
     }
 
-    /// True if more than half of this leader and its followers cannot log in at a candidate's broker.
+    /// True if more than half of the nodes (this leader and its followers) cannot log in at a
+    /// candidate's broker.
     pub(super) fn is_out_of_reach(&self, candidate: &NodeName, now: Timestamp) -> bool {
         if !self.peers.lacks_logins() && self.no_login.is_empty() {
             return false;
@@ -39,13 +43,14 @@ impl Election {
         2 * without > followers + 1
     }
 
-    /// The best candidates to lead next. Those that most cannot reach come last.
+    /// The best candidates to lead next. Candidates that most nodes cannot reach come last.
     pub(super) fn successors(&self, now: Timestamp) -> Vec<NodeName> {
         self.peers
             .successors(MAX_SUCCESSORS, |name| self.is_out_of_reach(name, now), now)
     }
 
-    /// The successor that this leader hands the lead to, as most of its followers cannot log in at its broker.
+    /// The successor to which this leader hands over because most of its followers cannot log in at
+    /// its broker.
     pub(super) fn relief(&self, now: Timestamp) -> Option<NodeName> {
         let State::Leading(leading) = &self.state else {
             return None;
@@ -59,8 +64,9 @@ impl Election {
         (is_ready && self.is_deserted(next, now)).then(|| next.clone())
     }
 
-    /// True if more than half of the followers cannot log in at this leader's broker, and two at least: one node alone may
-    /// lie. A cell of two is the exception. There each is served by its own broker, and the other leads if it is no worse.
+    /// True if more than half of the followers, and at least two, cannot log in at this leader's
+    /// broker: a single report may be false. A cell of two nodes is the exception: there each node
+    /// is served by its own broker, and the other node leads if its rank is not lower.
     fn is_deserted(&self, next: &NodeName, now: Timestamp) -> bool {
         let (without, followers) = self.peers.without_login(&self.id, &self.id, now);
         let is_equal = || {

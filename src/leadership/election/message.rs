@@ -1,4 +1,4 @@
-//! Messages of the election, as they travel between the nodes of a cell.
+//! Messages of the election, exchanged between the nodes of a cell.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
@@ -9,35 +9,41 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::wire::{self, DescriptionStamp, Encoding, Limits, RejectReason, Role};
 
-/// Most successors that a leader names, the standby first.
+/// Maximum number of successors that a leader names, the standby first.
 pub const MAX_SUCCESSORS: usize = 3;
 
-/// Most nodes that a message names at whose brokers its sender cannot log in.
+/// Maximum number of nodes in a message at whose brokers its sender cannot log in.
 pub const MAX_NO_LOGIN: usize = 4;
 
-/// Largest term taken from the wire: the largest integer that every JSON reader keeps exactly.
+/// Largest term accepted from the wire: the largest integer that every JSON reader represents
+/// exactly.
 pub const MAX_TERM: u64 = (1 << 53) - 1;
 
-/// Largest rise of the known term in [`TERM_WINDOW`](crate::leadership::timers::TERM_WINDOW). A cell uses one term per
-/// change of leader, so it never gets so far ahead of a node. A forged term near [`MAX_TERM`] would end elections for good.
+/// Maximum increase of the highest term within
+/// [`TERM_WINDOW`](crate::leadership::timers::TERM_WINDOW). A cell uses one term per change of
+/// leader, so it cannot get this far ahead of a node. A forged term near [`MAX_TERM`] would
+/// otherwise end elections for good.
 pub const MAX_TERM_STEP: u64 = 1 << 20;
 
-/// Largest term that a node without any takes from another: it may join a cell that has led for long.
+/// Maximum term that a node without any term accepts from another node; it may be joining a cell
+/// that has run for long.
 pub(crate) const MAX_FIRST_TERM: u64 = 1 << 40;
 
-/// Largest step by which one message raises the known number of the last round: more rounds than a cell publishes in
-/// years. A node that has just started believes any number up to [`MAX_ROUND`].
+/// Maximum step by which one message raises the number of the last round: more rounds than a cell
+/// publishes in years. A node that has just started accepts any number up to [`MAX_ROUND`].
 pub(super) const MAX_ROUND_STEP: u64 = 1 << 32;
 
-/// Largest round number taken from the wire. A leader that would go on from it begins anew: epochs order rounds first.
+/// Largest round number accepted from the wire. A leader that reaches it starts over: rounds are
+/// ordered by epoch first.
 pub const MAX_ROUND: u64 = 1 << 52;
 
-/// Largest encoded message in bytes; it fits one Ethernet frame with room for the membership's seal.
+/// Maximum size of an encoded message in bytes. It fits one Ethernet frame together with the
+/// membership's seal.
 pub const MAX_MESSAGE_BYTES: usize = 1200;
 
-/// One message; may be lost, repeated, delayed and re-ordered on its way.
+/// One election message. Messages may be lost, repeated, delayed and re-ordered in transit.
 ///
-/// The transport must prove the sender: the election believes [`Self::from`].
+/// The transport must authenticate the sender, because the election relies on [`Self::from`].
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct ElectionMessage {
     /// Major version of the message, [`wire::SCHEMA_VERSION`].
@@ -46,51 +52,53 @@ pub struct ElectionMessage {
     /// The sender.
     #[n(1)]
     pub from: NodeName,
-    /// The sender's run: when it started, in Unix microseconds by its own clock.
+    /// Identifies the sender's run by its start time, in Unix microseconds by the sender's clock.
     #[n(2)]
     pub run: u64,
-    /// Counts up with every message of a run, whoever it is for.
+    /// Sequence number within the run; it increases with every message to any addressee.
     #[n(3)]
     pub seq: u64,
-    /// The sender as a candidate.
+    /// The sender's properties as a candidate.
     #[serde(rename = "standing")]
     #[n(4)]
     pub candidacy: Candidacy,
-    /// The highest term that the sender knows to have been used.
+    /// The highest term that the sender has seen in use.
     #[n(5)]
     pub term: u64,
     /// The epoch that the sender follows or leads; absent while it has no leader.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(8)]
     pub epoch: Option<Epoch>,
-    /// True if the sender lately heard the addressee: links may work one way only.
+    /// True if the sender recently received a message of the addressee, because links may work in
+    /// one direction only.
     #[n(6)]
     pub hears_you: bool,
-    /// Its content.
+    /// The content.
     #[n(7)]
     pub body: Body,
-    /// Stamps by which the nodes compare their clocks; absent from nodes of earlier versions.
+    /// Stamps for comparing the nodes' clocks; absent from nodes of earlier versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub clock: Option<Box<ClockStamps>>,
-    /// The description of the cell that the sender has, version 0 without one; absent from nodes of earlier versions.
+    /// The sender's description of the cell, version 0 without one; absent from nodes of earlier
+    /// versions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(10)]
     pub description: Option<Box<DescriptionStamp>>,
 }
 
-/// A node as a candidate: its rank among possible leaders.
+/// A node's properties as a candidate, which define its rank among possible leaders.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]
 pub struct Candidacy {
-    /// The role it was started with.
+    /// The role with which the node was started.
     #[n(0)]
     pub role: Role,
-    /// Its configured priority, higher leads first.
+    /// The node's configured priority; a higher value leads first.
     #[n(1)]
     pub priority: u8,
-    /// Its processor load in quarters, damped.
+    /// The node's processor load in quarters, damped.
     #[n(2)]
     pub load: u8,
     /// True if broker, fuser and gateway all work.
@@ -98,30 +106,32 @@ pub struct Candidacy {
     pub fit: bool,
 }
 
-/// A leader's sign of life, which others can pass on and cannot make: how long it has led, under its signature.
+/// A leader's sign of life: how long it has led, under its signature. Other nodes can pass it on
+/// but cannot create one.
 #[derive(
     Debug, Clone, Default, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]
 pub struct LifeSign {
-    /// Time in ms for which the leader has led when it sent this, by its own clock.
+    /// Time in ms for which the leader had led when it sent this, by its own clock.
     #[n(0)]
     pub led_ms: u64,
-    /// Its signature in base64 under its cell, its epoch and `led_ms`; absent in a cell without certificates. The transport
-    /// adds and checks it.
+    /// The leader's signature in base64 over cell, epoch and `led_ms`; absent in a cell without
+    /// certificates. The transport adds and verifies it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(1)]
     pub signature: Option<Box<str>>,
 }
 
-/// The protocol. In the quiet, once the leader is known:
+/// The election protocol. In a quiet cell with a leader:
 ///
 /// ```text
 /// leader    -> successor   Beat      every beat_ms          successor -> leader   Status
 /// leader    -> others      Beat      every idle_beat_ms     other     -> leader   Status
 /// ```
 ///
-/// A node without a leader, or whose leader has missed two beats, asks around; the leader answers `Beat`, a node that
-/// hears the leader `LeaderEvidence`, any other `Status`. A claim to lead is a `Beat` of a higher epoch:
+/// A node without a leader, or whose leader has missed two beats, sends `Ask` to the other nodes.
+/// The leader answers `Beat`, a node that receives the leader's beats answers `LeaderEvidence`, and
+/// any other node `Status`. A claim to lead is a `Beat` of a higher epoch:
 ///
 /// ```text
 /// seeker    -> all         Ask
@@ -130,7 +140,7 @@ pub struct LifeSign {
 /// claimant  -> all         Beat      epoch + 1, after = the epoch it succeeds
 /// ```
 ///
-/// Handover, the old leader publishing all the while:
+/// Handover, during which the old leader continues to publish:
 ///
 /// ```text
 /// leader     -> challenger  Offer                 every beat_ms until Ready
@@ -139,55 +149,57 @@ pub struct LifeSign {
 /// challenger -> all         Beat                  epoch + 1, first round last_round + 1: the old leader stops
 /// ```
 ///
-/// A leader that cannot go on says `Resign` to all.
+/// A leader that cannot continue sends `Resign` to all nodes.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[cbor(flat)]
 pub enum Body {
-    /// "This is how I stand": a greeting, and the answer to a beat.
+    /// The sender's state: a greeting, or the answer to a beat.
     #[n(0)]
     Status {
-        /// The highest epoch that the sender knows to be over, such as that of a leader whose broker refused it, or that
-        /// it has lost when it refuses a lower one's beat.
+        /// The highest epoch that has ended according to the sender: the epoch of a leader whose
+        /// broker refused it, or the epoch that the sender has lost when it refuses a beat of a
+        /// lower epoch.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[n(0)]
         over: Option<Epoch>,
-        /// Leader and standby, now or before, at whose brokers the sender cannot log in; at most [`MAX_NO_LOGIN`].
+        /// Current or former leader and standby at whose brokers the sender cannot log in; at most
+        /// [`MAX_NO_LOGIN`].
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         #[cbor(n(1), default)]
         no_login: Vec<NodeName>,
     },
-    /// "Who leads, and who hears it?"
+    /// Question: which node leads, and which nodes receive its beats?
     #[n(1)]
     Ask {
-        /// Counts up with every question of the sender's run.
+        /// Number of the question, increasing within the sender's run.
         #[n(0)]
         ask: u64,
     },
-    /// "I hear the leader of my epoch": the answer to [`Body::Ask`].
+    /// The sender receives the leader of its epoch: the answer to [`Body::Ask`].
     #[serde(rename = "vouch")]
     #[n(2)]
     LeaderEvidence {
-        /// The question answered.
+        /// Number of the question.
         #[n(0)]
         ask: u64,
-        /// Time since the leader was heard, in ms.
+        /// Time since the sender last received the leader, in ms.
         #[n(1)]
         age_ms: u64,
         /// The last sign of life of the leader of the sender's epoch.
         #[n(2)]
         life: LifeSign,
     },
-    /// "I lead": the leader's sign of life.
+    /// The sender leads: its sign of life.
     #[n(3)]
     Beat {
-        /// Time until the addressee gets the next one, in ms.
+        /// Time until the next beat to the addressee, in ms.
         #[n(0)]
         every_ms: u64,
-        /// The round published last.
+        /// Number of the last published round.
         #[n(1)]
         round: u64,
-        /// Number of nodes that follow and are heard.
+        /// Number of followers from which the leader receives messages.
         #[n(2)]
         followers: u8,
         /// The epoch that this one succeeded, if any.
@@ -201,23 +213,23 @@ pub enum Body {
         #[n(5)]
         life: LifeSign,
     },
-    /// "Get ready to lead in my place": to the challenger.
+    /// Request to prepare for leading in the sender's place, sent to the challenger.
     #[n(4)]
     Offer,
-    /// "I am ready": to the leader.
+    /// The challenger is ready; sent to the leader.
     #[n(5)]
     Ready,
-    /// "Lead from the next round on": to the challenger.
+    /// Permission to lead from the next round on, sent to the challenger.
     #[n(6)]
     Yield {
         /// The last round published by the leader.
         #[n(0)]
         last_round: u64,
     },
-    /// "I no longer lead": to all.
+    /// The sender has stopped leading; sent to all nodes.
     #[n(7)]
     Resign {
-        /// The epoch that is over.
+        /// The epoch that has ended.
         #[n(0)]
         epoch: Epoch,
         /// The last round published in it.
@@ -261,16 +273,16 @@ impl wire::Payload for ElectionMessage {
 }
 
 impl ElectionMessage {
-    /// Writes the message.
+    /// Encodes the message.
     pub fn encode(&self, encoding: Encoding) -> Vec<u8> {
         wire::encode(self, encoding)
     }
 
-    /// Reads a message and checks every value in it.
+    /// Decodes a message and checks every value in it.
     ///
     /// # Errors
-    /// [`RejectReason::TooLarge`], [`RejectReason::UnknownSchema`], or [`RejectReason::Malformed`] also for values that
-    /// no node sends.
+    /// Returns [`RejectReason::TooLarge`], [`RejectReason::UnknownSchema`], or
+    /// [`RejectReason::Malformed`], also for values that no node sends.
     pub fn decode(bytes: &[u8]) -> Result<Self, RejectReason> {
         let limits = Limits {
             payload_bytes: MAX_MESSAGE_BYTES,
@@ -284,7 +296,7 @@ impl ElectionMessage {
         }
     }
 
-    /// The highest term of an epoch in the message.
+    /// The highest term among the epochs in the message.
     pub(super) fn highest_epoch(&self) -> u64 {
         let of_body = match &self.body {
             Body::Status { over, .. } => over.as_ref(),
@@ -422,7 +434,7 @@ mod tests {
         }
     }
 
-    /// Names in the code may change; what is on the wire may not.
+    /// Names in the code may change; names on the wire may not.
     #[test]
     fn the_wire_keeps_its_names() {
         let epoch = || Epoch::new(4, NodeName::from_static("edge"));

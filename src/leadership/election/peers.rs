@@ -1,4 +1,4 @@
-//! The other nodes as this one knows them, and their rank as candidates.
+//! The election's records of the other nodes, and their rank as candidates.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -11,7 +11,8 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
 
-/// Rank of a candidate; the lesser value is the higher rank: edge before auto, then the higher priority.
+/// Rank of a candidate. A smaller value is a higher rank: edge before auto, then the higher
+/// priority.
 pub(super) type Rank = (bool, Reverse<u8>);
 
 impl Candidacy {
@@ -24,37 +25,38 @@ impl Candidacy {
     }
 }
 
-/// Another node.
+/// State of another node.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Peer {
     pub(super) candidacy: Option<Candidacy>,
-    /// Epoch that it follows or leads, by its own message.
+    /// Epoch that the peer follows or leads, according to its last message.
     pub(super) epoch: Option<Epoch>,
-    /// True if our last message to it said that we hear it.
+    /// True if the last message to the peer confirmed that this node receives it.
     pub(super) told: bool,
-    /// Set while it refuses this node's leadership.
+    /// True while the peer refuses this node's leadership.
     refuses: bool,
-    /// Candidates at whose brokers it cannot log in, by its own word.
+    /// Candidates at whose brokers the peer reports that it cannot log in.
     no_login: Vec<NodeName>,
-    /// Leadership of this node that the peer was last told to be over.
+    /// Leadership of this node of which the peer was last notified that it is over.
     corrected: Option<Epoch>,
-    /// Lowest term that it stated, if it may lead; 0 before any.
+    /// Lowest term stated by the peer, if it may lead; 0 before any.
     term: u64,
     run: u64,
     seq: u64,
     heard_at: Option<Timestamp>,
-    /// Time since when it has been heard without a gap, fit, and of one rank.
+    /// Time since which the peer has been reachable without a gap, fit, and of one rank.
     fit_since: Option<Timestamp>,
-    /// Time until which it counts as gone although its messages may still be under way.
+    /// Time until which the peer counts as gone although delayed messages of it may still arrive.
     gone_until: Option<Timestamp>,
-    /// Time at which the membership gave it up, if it was not heard since.
+    /// Time at which the membership gave up the peer, if no message of it arrived since.
     given_up_at: Option<Timestamp>,
 }
 
-/// Largest step of the sequence numbers of a node that is heard. A leader of 200 nodes sends 4000 messages a second.
+/// Maximum step of the sequence numbers of a reachable node. A leader of 200 nodes sends 4000
+/// messages a second.
 pub(super) const MAX_SEQ_STEP: u64 = 1 << 16;
 
-/// All other nodes that were ever heard of and not given up.
+/// All other nodes that were discovered and not given up.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Peers {
     table: BTreeMap<NodeName, Peer>,
@@ -64,12 +66,12 @@ pub(super) struct Peers {
     response_timeout: Duration,
     given_up_timeout: Duration,
     standby_silence: Duration,
-    /// Time of the next look for peers that were given up and not heard since.
+    /// Time of the next check for peers that were given up and have been silent since.
     forget_at: Option<Timestamp>,
 }
 
 impl Peers {
-    /// No peers; timeouts are those of `config`.
+    /// Creates an empty set with the timeouts of `config`.
     pub(super) fn new(config: &ElectionConfig) -> Self {
         Self {
             table: BTreeMap::new(),
@@ -86,7 +88,7 @@ impl Peers {
         self.table.entry(name.clone()).or_default();
     }
 
-    /// Notes a term above 0 that a possible leader states.
+    /// Records a term above 0 that a possible leader states.
     pub(super) fn note_term(&mut self, name: &NodeName, term: u64) {
         let lowest = &mut self.table.entry(name.clone()).or_default().term;
         *lowest = if *lowest == 0 {
@@ -96,7 +98,7 @@ impl Peers {
         };
     }
 
-    /// The lowest term that a possible leader states; none while no node knows of any.
+    /// The lowest term stated by a possible leader; `None` while no possible leader has stated one.
     pub(super) fn lowest_term(&self) -> Option<u64> {
         self.table
             .values()
@@ -113,7 +115,7 @@ impl Peers {
         self.table.get(name)
     }
 
-    /// Notes that a peer is sent a message, which says whether it is heard; gives that.
+    /// Records that a message is sent to a peer. Returns the `hears_you` flag for that message.
     pub(super) fn tell(&mut self, name: &NodeName, now: Timestamp) -> bool {
         let Some(peer) = self.table.get_mut(name) else {
             return false;
@@ -124,8 +126,8 @@ impl Peers {
         peer.told
     }
 
-    /// True if a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its
-    /// answer is answered too.
+    /// True if a peer follows a leadership of `leader` that is over and has not been notified of
+    /// it. The peer is notified once per leadership, because its answer is answered too.
     pub(super) fn correct(
         &mut self,
         name: &NodeName,
@@ -146,21 +148,21 @@ impl Peers {
         is_news
     }
 
-    /// Notes whether a peer refuses this node's leadership.
+    /// Records whether a peer refuses this node's leadership.
     pub(super) fn note_refusal(&mut self, name: &NodeName, refuses: bool) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.refuses = refuses;
         }
     }
 
-    /// True if a peer heard lately refuses this node's leadership.
+    /// True if a recently received peer refuses this node's leadership.
     pub(super) fn any_refuses(&self, now: Timestamp) -> bool {
         self.table
             .iter()
             .any(|(name, peer)| peer.refuses && self.hears(name, now))
     }
 
-    /// Notes at whose brokers a peer cannot log in.
+    /// Records at whose brokers a peer cannot log in.
     pub(super) fn note_no_login(&mut self, name: &NodeName, at: Vec<NodeName>) {
         if at.is_empty() && !self.lacks_logins {
             return;
@@ -176,7 +178,8 @@ impl Peers {
         self.lacks_logins
     }
 
-    /// Number of followers of `leader`, without `at`, that cannot log in at the broker of `at`, and number of all.
+    /// Number of followers of `leader`, except `at`, that cannot log in at the broker of `at`, and
+    /// number of all followers.
     pub(super) fn without_login(
         &self,
         leader: &NodeName,
@@ -202,7 +205,8 @@ impl Peers {
             .is_some_and(|peer| peer.no_login.contains(at))
     }
 
-    /// True if a message's number can be that of its sender's next: messages are sent to each node, and some are lost.
+    /// True if a message's sequence number is plausible as the sender's next. Gaps occur because
+    /// the sender also sends to other nodes and messages are lost.
     pub(super) fn is_in_sequence(&self, message: &ElectionMessage, now: Timestamp) -> bool {
         let known = self
             .table
@@ -216,7 +220,8 @@ impl Peers {
         })
     }
 
-    /// Notes what every message says about its sender; false for one that is repeated or overtaken.
+    /// Records the sender's state from the fields that every message has. Returns false for a
+    /// repeated or overtaken message.
     pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
         let contact_timeout = self.contact_timeout;
         let peer = self.table.entry(message.from.clone()).or_default();
@@ -235,7 +240,8 @@ impl Peers {
         } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
             peer.fit_since = Some(now);
         }
-        // A new run, or one out of touch, has to be told again that it is heard.
+        // A new run, or a peer that was out of contact, has to be informed again that this node
+        // receives it.
         peer.told &= !silent && message.run == peer.run;
         peer.run = message.run;
         peer.seq = message.seq;
@@ -255,7 +261,8 @@ impl Peers {
         }
     }
 
-    /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
+    /// Removes a peer that the membership gave up: at once if the peer has been silent, otherwise
+    /// when it stays silent.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
         let Some(peer) = self.table.get_mut(name) else {
             return;
@@ -271,7 +278,7 @@ impl Peers {
         }
     }
 
-    /// Forgets who was given up and not heard since.
+    /// Removes the peers that were given up and have been silent since.
     pub(super) fn forget_silent(&mut self, now: Timestamp) {
         if self.forget_at.is_none_or(|at| now < at) {
             return;
@@ -287,20 +294,20 @@ impl Peers {
             .map(|at| at + wait);
     }
 
-    /// True if a peer has been heard and fit for `stable`.
+    /// True if a peer has been reachable and fit for `stable`.
     pub(super) fn is_stable(&self, name: &NodeName, stable: Duration, now: Timestamp) -> bool {
         let since = self.table.get(name).and_then(|peer| peer.fit_since);
         self.hears(name, now) && since.is_some_and(|since| now >= since + stable)
     }
 
-    /// Lets a peer prove itself anew before it is handed the lead.
+    /// Restarts the time for which a peer must be stable before leadership is handed to it.
     pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.fit_since = peer.fit_since.map(|_| now);
         }
     }
 
-    /// True if a peer was heard lately.
+    /// True if a message of the peer was received recently.
     pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table
             .get(name)
@@ -308,7 +315,7 @@ impl Peers {
             .is_some_and(|at| now.since(at) <= self.contact_timeout)
     }
 
-    /// True if a peer was heard at `since` or later.
+    /// True if a message of the peer was received at `since` or later.
     pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
         self.table
             .get(name)
@@ -316,8 +323,8 @@ impl Peers {
             .is_some_and(|at| at >= since)
     }
 
-    /// Number of nodes heard lately that follow a leader, by their own word. Parts share the certificate of their node, which
-    /// counts once.
+    /// Number of recently received nodes that report that they follow `leader`. The parts of a node
+    /// share its certificate, so a node counts once.
     pub(super) fn followers(&self, leader: &NodeName, now: Timestamp) -> usize {
         self.followers_of(leader, now).count()
     }
@@ -338,7 +345,7 @@ impl Peers {
             .filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
     }
 
-    /// True if a peer could lead, as far as is known without having heard it lately.
+    /// True if a peer could lead, judged by its last messages even if they are old.
     pub(super) fn may_lead(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table.get(name).is_some_and(|peer| {
             peer.candidacy.is_some_and(|candidacy| candidacy.may_lead())
@@ -346,8 +353,8 @@ impl Peers {
         })
     }
 
-    /// True if a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
-    /// said of itself long ago.
+    /// True if a peer that a leader named as successor could still lead. The leader's list is more
+    /// recent than an old message of the peer.
     pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
         let unfit = |peer: &Peer| {
             peer.candidacy
@@ -359,7 +366,7 @@ impl Peers {
             .is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
     }
 
-    /// Everyone who could lead, in no order of preference.
+    /// All nodes that could lead, in no particular order.
     pub(super) fn candidates(
         &self,
         now: Timestamp,
@@ -370,9 +377,10 @@ impl Peers {
             .filter_map(|(name, peer)| Some((name, peer.candidacy?)))
     }
 
-    /// The leader's successors: heard lately and fit, the best first. The membership may hear less than the election does.
-    /// So a peer that it gave up remains a successor if it was heard within the beats that a standby may miss. Those that
-    /// are `out_of_reach` come last.
+    /// The leader's successors: recently received and fit, the best first. The membership may have
+    /// less information than the election, so a peer that the membership gave up stays a successor
+    /// if a message of it arrived within the beats that a standby may miss. Peers that are
+    /// `out_of_reach` come last.
     pub(super) fn successors(
         &self,
         limit: usize,
@@ -400,10 +408,12 @@ impl Peers {
             .collect()
     }
 
-    /// The best peer of a higher rank than `ours`, and the time at which it has been fit for `stable`.
+    /// The best peer of a higher rank than `ours`, and the time at which it has been fit for
+    /// `stable`.
     ///
-    /// Neither load nor name takes the lead from a living leader: leading is load, and a move among equals serves nobody.
-    /// Waits for a better candidate that is more than halfway through `stable`; otherwise the lead moves twice.
+    /// Load and name don't move leadership away from a living leader: leading itself causes load,
+    /// and a move among equals has no benefit. If a better candidate is more than halfway through
+    /// `stable`, the method waits for it, because leadership would otherwise move twice.
     pub(super) fn challenger(
         &self,
         ours: Rank,

@@ -1,4 +1,4 @@
-//! Without a leader: asking around, and claiming the lead in turn.
+//! Seeking a leader: asking other nodes, and claiming leadership in turn.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -14,17 +14,17 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// A node that knows of no leader.
+/// State of a node without a leader.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Seeking {
-    /// Time at which the first in turn may claim.
+    /// Time at which the first candidate in turn may claim.
     since: Timestamp,
-    /// The successors named by the lost leader; others come after them.
+    /// The successors named by the lost leader; other candidates come after them.
     order: Vec<NodeName>,
-    /// Time of the first question about the lost leader that nobody answered.
+    /// Time of the first unanswered question about the lost leader.
     asked_at: Option<Timestamp>,
     ask_at: Timestamp,
-    /// Evidence of the lost leader must be newer than this to bring it back.
+    /// Evidence of the lost leader must be newer than this time to bring the leader back.
     pub(super) known_until: Timestamp,
 }
 
@@ -40,7 +40,8 @@ impl Seeking {
     }
 }
 
-/// The latest questions. Evidence is dated from the question that it answers, so stale evidence cannot circulate.
+/// The latest questions. Evidence is dated from the question that it answers, so stale evidence
+/// cannot circulate.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Questions {
     count: u64,
@@ -94,7 +95,8 @@ impl Election {
         }
     }
 
-    /// Seeks a leader; the first of `order` that can leads at once, the next one step later.
+    /// Starts seeking. The first candidate in `order` that can lead claims at once, the next
+    /// candidate one step later.
     pub(super) fn seek(&mut self, order: Vec<NodeName>, since: Timestamp, now: Timestamp) {
         let (known_until, asked_at) = match &self.state {
             State::Following(following) => (
@@ -103,7 +105,7 @@ impl Election {
             ),
             State::Seeking(_) | State::Leading(_) => (now, None),
         };
-        // The first in turn is heard before everyone has to ask.
+        // Waits for the claim of the first candidate in turn before it asks all nodes.
         let ask_at = now + self.config.answer_time();
         self.state = State::Seeking(Seeking {
             known_until,
@@ -117,7 +119,7 @@ impl Election {
         self.send_all(&Body::Ask { ask }, now);
     }
 
-    /// Asks the leader itself, and those who hear it often.
+    /// Asks the leader itself and its successors, which receive beats often.
     pub(super) fn ask_near(&mut self, now: Timestamp) {
         let State::Following(following) = &self.state else {
             return;
@@ -130,8 +132,9 @@ impl Election {
         }
     }
 
-    /// Answers a question about the leader: how long ago this node received something of it, with its last sign of life. One
-    /// that is old convinces nobody: then the leader is asked for another, which answers the question too.
+    /// Answers a question about the leader: states how long ago this node last received the leader,
+    /// with the leader's last sign of life. An old sign of life proves too little; in that case
+    /// this node asks the leader for a new one, and answers the question with it.
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         let patience = self.config.response_timeout();
         let life = self
@@ -162,13 +165,16 @@ impl Election {
         self.send_status(from, now);
     }
 
-    /// Answers the questions that waited for a sign of life of the leader, which has just come.
+    /// Answers the waiting questions after a sign of life of the leader has arrived.
     pub(super) fn answer_waiting(&mut self, now: Timestamp) {
         for (from, ask) in std::mem::take(&mut self.waiting_questions) {
             self.answer(&from, ask, now);
         }
     }
 
+    /// Processes another node's evidence about the leader. The evidence is dated by the question
+    /// that it answers and by the leader's own sign of life; it can keep or bring back a leader, or
+    /// make this node follow a leader of a higher epoch.
     pub(super) fn take_leader_evidence(
         &mut self,
         from: &NodeName,
@@ -193,7 +199,8 @@ impl Election {
                     .insert(LeaderClock::of_beat(epoch.clone(), life.clone(), now))
             }
         };
-        // Whatever its sender says, the leader was alive when it sent its sign of life, and not known to be later.
+        // Regardless of the stated age, the leader was alive when it sent its sign of life, and no
+        // later time is proven.
         let heard_at = (asked_at - Duration::from_millis(age_ms)).min(clock.observe(life, now));
         let believable = heard_at + self.config.response_timeout() > now;
         let doubtful = match &mut self.state {
@@ -212,7 +219,7 @@ impl Election {
         }
     }
 
-    /// Takes the lead in an unused term, succeeding `after`, and tells all.
+    /// Starts leading in an unused term as successor of `after`, and sends a beat to all nodes.
     pub(super) fn lead(&mut self, after: Option<Epoch>, now: Timestamp) {
         let term = self.terms.seen.max(self.terms.found) + 1;
         self.persist(term);
@@ -241,7 +248,7 @@ impl Election {
         self.beat_all(now);
     }
 
-    /// Gives up the lead for want of broker, fuser or gateway, or because the node stops.
+    /// Resigns leadership because broker, fuser or gateway failed, or because the node stops.
     pub(super) fn resign(&mut self, now: Timestamp) {
         let State::Leading(leading) = &mut self.state else {
             return;
@@ -262,10 +269,10 @@ impl Election {
         );
     }
 
-    /// Time of this node's turn to claim; `None` when it may not lead.
+    /// Time of this node's turn to claim; `None` if it may not lead.
     ///
-    /// A node that did not answer when the leader was doubted is as much out of reach as the leader. It is waited for no
-    /// longer than an answer takes.
+    /// A node that did not answer when the leader was suspected counts as unreachable, like the
+    /// leader. This node waits for it no longer than an answer takes.
     fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
         let turn =
             |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
@@ -278,10 +285,11 @@ impl Election {
             .then(|| among_present.map_or(in_order, |at| at.min(in_order)))
     }
 
-    /// Number of nodes that would claim before this one, of those heard at `since` or later if it is given.
+    /// Number of nodes that would claim before this node. If `since` is given, only nodes received
+    /// at `since` or later count.
     ///
-    /// The successors come first, in the order in which the lost leader named them: it heard them all, whereas what a
-    /// follower knows of others may be as old as their first greeting.
+    /// The successors come first, in the order of the lost leader, which received messages from all
+    /// nodes. A follower's own record of other nodes may be as old as their first greeting.
     fn place(&self, order: &[NodeName], since: Option<Timestamp>) -> u32 {
         let now = self.clock.now();
         let present = |name: &NodeName| since.is_none_or(|at| self.peers.heard_since(name, at));

@@ -31,7 +31,7 @@ fn euclid_after(saved_term: u64) -> Election {
     election
 }
 
-/// A message of a node that follows or leads `epoch`, and hears this one.
+/// A message of a node that follows or leads `epoch` and receives this node's messages.
 fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionMessage {
     ElectionMessage {
         schema: SCHEMA_VERSION,
@@ -70,7 +70,7 @@ fn beat_after(after: Option<&Epoch>) -> Body {
     }
 }
 
-/// A message of edge, the leader of term 8, that knows `term`.
+/// A message of edge, the leader of term 8, stating `term`.
 fn of_edge(seq: u64, term: u64, body: Body) -> ElectionInput {
     let message = message(
         &NodeName::from_static("edge"),
@@ -210,7 +210,8 @@ fn a_node_without_a_term_joins_a_cell_of_any_age() {
     )));
 }
 
-/// First round of euclid's own leadership after the leader's beats with these rounds, and the beats that were counted.
+/// First round of euclid's own leadership after the leader's beats with these rounds, and the
+/// number of counted beats.
 fn succeeded_after(rounds: &[u64]) -> (u64, usize) {
     let mut election = euclid();
     let beats = (1..)
@@ -348,7 +349,7 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     assert_eq!(election.leader(), Some(&gauss));
 }
 
-/// A leader stays when another node follows a leader that was never heard.
+/// A leader stays when another node follows a leader that has not been received.
 #[test]
 fn the_word_about_an_unknown_leader_ends_no_leadership() {
     let mut election = euclid();
@@ -388,8 +389,8 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     assert!(election.is_leading());
 }
 
-/// After a split: the follower has met the edge, which this leader has not heard yet. In a later term it would be one more
-/// leader to outdo.
+/// After a split: the follower now follows the edge, which this leader has not received yet.
+/// Leading in a later term would create one more leader to outbid.
 #[test]
 fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
@@ -415,7 +416,8 @@ fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
     }
 }
 
-/// A leader has no followers yet when it begins. A vehicle that says then that it follows another ends no leadership.
+/// A leader has no followers yet when it begins. A vehicle that reports another leader at that time
+/// does not end the leadership.
 #[test]
 fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
     let [edge, hopper] = ["edge", "hopper"].map(NodeName::from_static);
@@ -459,7 +461,7 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
     };
     tell(&mut election, 1, now);
     assert!(election.is_leading());
-    // True news come from the other leader itself.
+    // A true change of leader is announced by the other leader itself.
     let mut told = election.clone();
     told.handle(
         received(
@@ -518,7 +520,7 @@ fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
         for effect in election.tick(now) {
             if let ElectionEffect::Lead { epoch, .. } = effect {
                 led.push(now);
-                // Gauss sent this before it heard of the new epoch.
+                // Gauss sent this before it received the new epoch.
                 status(&mut election, None, Some(epoch), now);
             }
         }
@@ -572,7 +574,7 @@ fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() 
     );
 }
 
-/// A message of gauss, which claims to have taken over from edge and to be followed by all.
+/// A message of gauss that claims that it has taken over from edge and that all nodes follow it.
 fn claim_of_gauss(seq: u64) -> ElectionInput {
     let gauss = NodeName::from_static("gauss");
     let epoch = Epoch::new(9, gauss.clone());
@@ -751,7 +753,7 @@ fn a_claim_waits_no_longer_for_being_repeated() {
     assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
 }
 
-/// One certificate is good for several names: a node's and those of its parts.
+/// One certificate is valid for several names: the node's name and the names of its parts.
 #[test]
 fn the_parts_of_a_node_depose_no_leader() {
     let (mut election, mut now) = (euclid(), NOW);

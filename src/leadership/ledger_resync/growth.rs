@@ -8,11 +8,12 @@ use crate::model::time::Timestamp;
 use crate::reputation::{EntryKey, ReputationLedger};
 use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, Limits, Payload};
 
-/// Maximum number of votes of a vehicle for one label in a leadership when this node first hears of them: 100 million,
-/// three years at one a second.
+/// Maximum number of votes of a vehicle for one label in a leadership when this node first receives
+/// the count: 100 million, which is three years at one vote per second.
 pub(super) const MAX_FIRST_VOTES: u64 = 100_000_000;
 
-/// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in ten reports.
+/// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in
+/// ten reports.
 const MAX_VOTES_PER_S: u64 = 10_240;
 
 /// Votes by which a count may be ahead of [`MAX_VOTES_PER_S`].
@@ -41,7 +42,7 @@ pub fn is_plausible(share: &LedgerShare) -> bool {
             .all(|mark| unknown.admits_mark(mark, never))
 }
 
-/// Number of votes of each count when this node first heard of it, with the time.
+/// Number of votes of each count when this node first received it, with the time.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct GrowthLimit {
     /// Marks have no label.
@@ -49,8 +50,8 @@ pub(super) struct GrowthLimit {
 }
 
 impl GrowthLimit {
-    /// The limit of a node that starts with a ledger: what it missed meanwhile may come at the rate of the fastest votes.
-    /// No clock says how long it was down.
+    /// The limit of a node that starts with a ledger. Votes that it missed may arrive at the rate
+    /// of the fastest votes, because no clock measures how long the node was down.
     pub(super) fn of(ledger: &ReputationLedger, now: Timestamp) -> Self {
         let mut limit = Self::default();
         ledger
@@ -62,7 +63,7 @@ impl GrowthLimit {
         limit
     }
 
-    /// True if a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
+    /// True if a count is plausible. [`Self::note`] records the first count of a vehicle and label.
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
         self.admits_votes(
             &key_of(entry),
@@ -78,7 +79,7 @@ impl GrowthLimit {
             && self.admits_votes(&key_of_mark(mark), votes, now)
     }
 
-    /// Notes the counts of a share that the ledger has now.
+    /// Records the counts of a share that the ledger has now.
     pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
         for entry in share
             .entries
@@ -98,7 +99,8 @@ impl GrowthLimit {
             .or_insert((now, entry.correct.saturating_add(entry.incorrect)));
     }
 
-    /// Notes a mark with the counts beside it: a lane that is heard of late has marks of long ago.
+    /// Records a mark with the counts of the ledger, because a recently received lane may have old
+    /// marks.
     fn note_mark(&mut self, mark: &LedgerMark, ledger: &ReputationLedger, now: Timestamp) {
         let votes = mark
             .correct
@@ -107,7 +109,7 @@ impl GrowthLimit {
         self.first.entry(key_of_mark(mark)).or_insert((now, votes));
     }
 
-    /// Forgets the lanes that are not `known`.
+    /// Removes the lanes for which `is_known` is false.
     pub(super) fn retain(&mut self, is_known: impl Fn(&Epoch) -> bool) {
         self.first.retain(|key, _| is_known(&key.lane));
     }

@@ -1,4 +1,4 @@
-//! Evidence of others: whose is accepted, what it costs, and how it survives the end of leaders.
+//! Evidence of other nodes: which evidence is accepted, what it costs, and how it outlives leaders.
 
 mod trial;
 
@@ -68,7 +68,7 @@ impl Candidate {
         )
     }
 
-    /// Lets snapshot periods pass; returns what is shared.
+    /// Lets snapshot periods pass; returns the shares.
     fn wait(&mut self, periods: u32) -> Vec<LedgerShare> {
         let now = Timestamp(self.now_ms * 1000);
         let tick = |_| {
@@ -79,7 +79,7 @@ impl Candidate {
         (0..periods * PERIOD).flat_map(tick).collect()
     }
 
-    /// Lets time pass, a publication period each second; returns what is shared.
+    /// Lets time pass, one publication period per second; returns the shares.
     fn wait_until(&mut self, at_ms: u64) -> Vec<LedgerShare> {
         let mut shares = Vec::new();
         while self.now_ms < at_ms {
@@ -94,7 +94,7 @@ impl Candidate {
         shares
     }
 
-    /// Takes in shares; returns what comes back.
+    /// Merges shares; returns the answers.
     fn hear(&mut self, shares: &[LedgerShare]) -> Vec<LedgerShare> {
         let now_ms = self.now_ms;
         shares
@@ -351,7 +351,8 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
     b2.hear(&b1.wait(1));
     drop(b1);
     b2.lead(3);
-    // The loser's messages when the sides heal are lost: it is not yet linked to the winner's broker.
+    // The loser's messages when the sides heal are lost: it is not yet linked to the winner's
+    // broker.
     b2.resync.step_down();
     drop(b2.resync.snapshot(&b2.ledger));
     a.lead(4);
@@ -679,7 +680,8 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
     assert_eq!(leader.vehicles(), ["gauss"]);
 }
 
-/// Two sides of a split counted. The one that leads on must not count before the other's votes.
+/// Two sides of a split have counted votes. The side that continues to lead must not place its
+/// counts before the other side's votes.
 #[test]
 fn the_votes_after_a_heal_are_the_latest() {
     let config = ReputationConfig::default();
@@ -705,7 +707,8 @@ fn the_votes_after_a_heal_are_the_latest() {
     assert!(edge.ledger.reputations(&config)[&name("euclid")].score < before);
 }
 
-/// A follower that claims a higher term makes the leader renew its own: that costs no older evidence.
+/// A follower that claims a higher term makes the leader renew its own: that costs no older
+/// evidence.
 #[test]
 fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
     let (mut edge, mut gauss) = (Candidate::new("edge"), Candidate::new("gauss"));

@@ -68,39 +68,41 @@ pub enum Input {
     },
     /// The membership doubts a node.
     MemberSuspected {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// The membership gave a node up.
     MemberDown {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
-    /// The node's own broker listens, or no longer does.
+    /// The node's own broker started or stopped listening.
     OwnBroker {
         /// Its address.
         address: Option<SocketAddr>,
     },
-    /// A broker has shown the certificate of a node in its last handshake. It comes before the link's new state.
+    /// A broker has shown the certificate of a node in its last handshake. It comes before the
+    /// link's new state.
     BrokerProven {
         /// The broker.
         broker: BrokerAddress,
-        /// The node.
+        /// Name of the node.
         node: NodeName,
     },
-    /// One of the gateway's links changed.
+    /// The state of one of the gateway's links changed.
     LinkChanged {
         /// The broker at its other end.
         broker: BrokerAddress,
         /// Its state now.
         state: LinkState,
     },
-    /// A broker passed on what a node says about itself, or its last will.
+    /// A broker forwarded a node's status or its last will.
     StatusHeard {
         /// The status.
         status: NodeStatus,
     },
-    /// A round was accepted by the node's [`RoundFilter`](crate::leadership::round_filter::RoundFilter).
+    /// A round was accepted by the node's
+    /// [`RoundFilter`](crate::leadership::round_filter::RoundFilter).
     RoundAccepted {
         /// The epoch it was published in.
         epoch: Epoch,
@@ -118,7 +120,7 @@ pub enum Input {
         rounds_due: u64,
         /// Processor load of the machine, 0 to 100 %.
         load_percent: u8,
-        /// All nodes that the membership knows.
+        /// All nodes that the membership has discovered.
         members: Vec<SeenMember>,
     },
     /// The answer to [`Effect::AskParts`], later.
@@ -126,9 +128,9 @@ pub enum Input {
         /// The answer.
         sample: HealthSample,
     },
-    /// The fuser was started anew and has forgotten that it leads.
+    /// The fuser was restarted and has lost the state of leading.
     FuserRestarted,
-    /// The gateway was started anew and has no links.
+    /// The gateway was restarted and has no links.
     GatewayRestarted,
     /// The settings that all nodes of the cell share have changed.
     Described {
@@ -139,9 +141,9 @@ pub enum Input {
         /// True if the node keeps reputations.
         keeps_reputations: bool,
     },
-    /// Parts of the node's status that it tells to all. It may come with every look.
+    /// Parts of the node's published status. This input may come with every check.
     Telling {
-        /// All present troubles that the node knows of.
+        /// All current troubles of the node.
         troubles: Vec<Trouble>,
         /// Address and port of its page.
         page: Option<String>,
@@ -153,9 +155,11 @@ pub enum Input {
 /// Something that the actors of a node must do, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Effect {
-    /// Hand a term to the disk, without waiting for it. It is mostly on disk long before it is needed.
+    /// Hand a term to the disk, without waiting for it. It is mostly on disk long before it is
+    /// needed.
     PersistTerm {
-        /// To be given to [`LeadershipNode::new`](crate::leadership::node::LeadershipNode::new) after a restart.
+        /// To be given to [`LeadershipNode::new`](crate::leadership::node::LeadershipNode::new)
+        /// after a restart.
         term: u64,
     },
     /// Send a message once, without waiting.
@@ -165,17 +169,19 @@ pub enum Effect {
         /// The message.
         message: ElectionMessage,
     },
-    /// Show the leadership to all other parts. It comes before the [`Effect::Lead`] that it announces: the node's broker
-    /// admits the first round only if it knows the leader.
+    /// Publish the leadership to all other parts. It precedes the [`Effect::Lead`] that it
+    /// announces, because the node's broker admits the first round only after it has received the
+    /// new leader.
     TellLeadership {
         /// The leadership.
         leadership: Leadership,
     },
-    /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to renew its own.
+    /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to
+    /// renew its own.
     ///
     /// This effect and all later ones wait until the disk has answered for the epoch's term, or for
-    /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops no leader: availability
-    /// comes before the uniqueness of epochs.
+    /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops
+    /// no leader: availability comes before the uniqueness of epochs.
     Lead {
         /// The node's leadership.
         epoch: Epoch,
@@ -184,9 +190,10 @@ pub enum Effect {
         /// Time at which it is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole length: another node is about to lead from the next one on.
+    /// Let the present round last its whole length: another node is about to lead from the next one
+    /// on.
     HoldRound,
-    /// Publish nothing more in this epoch.
+    /// Stop publishing in this epoch.
     StopPublishing {
         /// The leadership that ended.
         epoch: Epoch,
@@ -196,21 +203,21 @@ pub enum Effect {
         /// The brokers.
         links: WantedLinks,
     },
-    /// Tell all nodes this about the node.
+    /// Publish this status of the node.
     PublishStatus {
         /// The status.
         status: NodeStatus,
     },
     /// Share all evidence about vehicles: a node needs it to lead, or to remain the leader.
     SendSnapshot {
-        /// The node.
+        /// Name of the node.
         to: NodeName,
     },
-    /// Look at the own parts and hand in [`Input::Looked`] at once.
+    /// Check the node's own parts and pass [`Input::Looked`] at once.
     Look,
-    /// Ask broker, gateway and fuser, and hand in [`Input::PartsAnswered`] when they have answered.
+    /// Query broker, gateway and fuser, and pass [`Input::PartsAnswered`] when they have answered.
     AskParts,
-    /// Count a message of this node that states a term or round beyond what a cell can have reached.
+    /// Count a message of this node that states an implausibly high term or round.
     CountImplausible {
         /// The sender.
         from: NodeName,
@@ -222,7 +229,7 @@ pub enum Effect {
     },
 }
 
-/// Something worth a line in the log that no other effect tells.
+/// An event for the log that is not visible in any other effect.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Notice {
     /// All parts work again.
@@ -239,7 +246,7 @@ pub enum Notice {
     },
     /// A node's process is gone: its broker ended.
     ProcessGone {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
         /// Its broker.
         broker: BrokerAddress,
@@ -254,9 +261,10 @@ pub enum Notice {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// A node is ready to be handed the lead, and this node is not logged in at its broker, or another node's is there.
+    /// A node is ready to take over leadership, but this node is not logged in at its broker, or
+    /// another node's broker answers at its address.
     NotServed {
-        /// The node.
+        /// Name of the node.
         challenger: NodeName,
     },
     /// This node cannot log in at brokers that it should use, or it can again.
@@ -273,7 +281,7 @@ pub enum Notice {
     },
     /// A node declared more than its certificate allows, or claimed a lead that it may not have.
     Overreached {
-        /// The node.
+        /// Name of the node.
         from: NodeName,
         /// The role that it declared.
         role: Role,
@@ -292,7 +300,7 @@ pub enum Notice {
 }
 
 impl NodeSettings {
-    /// True if the node never leads.
+    /// True if the node cannot become leader.
     pub(super) fn is_vehicle_only(&self) -> bool {
         self.election.role == Role::Cav
     }

@@ -1,4 +1,4 @@
-//! The members of the cell: where they and their brokers are, or were a moment ago.
+//! The members of the cell: the current and recent addresses of their machines and brokers.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use crate::leadership::timers::{DEPARTED_TIME, REDISCOVERY_TIME};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// The living members, and those that were given up a moment ago.
+/// The living members, and recently removed members.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Members {
     living: BTreeMap<NodeName, SeenMember>,
@@ -19,12 +19,13 @@ pub(super) struct Members {
 }
 
 impl Members {
-    /// Notes a living member.
+    /// Records a living member.
     pub(super) fn place(&mut self, member: SeenMember) {
         self.living.insert(member.name.clone(), member);
     }
 
-    /// Forgets a member, but not at once where its broker was: that may end a moment later.
+    /// Removes a member. The address of its broker is kept for a while, because that broker's end
+    /// may be noticed a moment later.
     pub(super) fn part_with(&mut self, name: &NodeName, now: Timestamp) {
         self.departed.retain(|_, (_, until)| now < *until);
         if let Some(broker) = self.living.remove(name).and_then(|member| member.broker) {
@@ -33,7 +34,7 @@ impl Members {
         }
     }
 
-    /// True if this run of a member is known.
+    /// True if this run of a member is already stored.
     pub(super) fn knows(&self, member: &SeenMember) -> bool {
         self.living
             .get(&member.name)
@@ -71,7 +72,7 @@ impl Members {
         self.living.get(name)?.broker.clone()
     }
 
-    /// Nodes whose broker is, or was a moment ago, at this address.
+    /// Nodes whose broker is or recently was at this address.
     pub(super) fn at(&self, broker: &BrokerAddress, now: Timestamp) -> Vec<NodeName> {
         let living = self
             .living

@@ -22,7 +22,7 @@ fn status(role: Role) -> NodeStatus {
     NodeStatus::starting(name("euclid"), Uuid::nil(), role, "1.0")
 }
 
-/// The node `euclid` and what it has been told to do.
+/// The node `euclid` and the effects that it has returned.
 struct Scene {
     machine: LeadershipNode,
     now: Timestamp,
@@ -89,7 +89,7 @@ impl Scene {
         scene
     }
 
-    /// Hands in an input; looks at the parts, which all work, are answered at once.
+    /// Passes an input; checks of the parts, which all work, are answered at once.
     fn take(&mut self, input: Input) {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
@@ -149,7 +149,7 @@ impl Scene {
         }
     }
 
-    /// Hears from `edge`, which leads in term 7.
+    /// Receives a message from `edge`, which leads in term 7.
     fn hear(&mut self, body: Body) {
         self.hear_in(Epoch::new(7, name("edge")), body);
     }
@@ -276,7 +276,7 @@ fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
     assert_ne!(scene.machine.leadership.leader(), Some(&name("edge")));
 }
 
-/// Any member can say in the broker's place that the leader's connection broke.
+/// Any member can forge the broker's report that the leader's connection broke.
 #[test]
 fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
@@ -351,7 +351,8 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
     }
 }
 
-/// A leader to which a better candidate says that it is ready. It can log in at `broker`, if one is given.
+/// A leader that receives `Ready` from a better candidate. The leader can log in at `broker`, if
+/// one is given.
 fn leading_beside_a_ready_challenger(
     external: Option<SocketAddr>,
     broker: Option<SocketAddr>,
@@ -424,7 +425,7 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
 
 #[test]
 fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
-    // An external broker that is down serves nobody either.
+    // An external broker that is down does not serve the challenger either.
     for external in [None, Some(broker(9))] {
         let scene = leading_beside_a_ready_challenger(external, None);
         assert_eq!(scene.position_of(is_yield), None, "{external:?}");
@@ -685,7 +686,7 @@ fn who_only_follows_declares_nothing_by_its_priority() {
     );
 }
 
-/// A leader hands its lead to an `edge`, but not to a node that only says that it is one.
+/// A leader hands leadership over to an `edge`, but not to a node that merely claims that role.
 #[test]
 fn a_declared_role_beyond_the_certificate_takes_no_lead() {
     for (role, is_offered) in [(Role::Edge, true), (Role::Auto, false)] {

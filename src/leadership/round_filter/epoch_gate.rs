@@ -1,12 +1,13 @@
-//! The order of rounds: neither epochs nor the rounds of one epoch go back.
+//! The order of rounds: epochs, and the rounds within an epoch, only increase.
 
 use crate::model::epoch::Epoch;
 use crate::wire::RejectReason;
 
-/// Admits the rounds of one topic so that neither epoch nor, within an epoch, round ever goes back.
+/// Admits the rounds of one topic so that the epoch, and the round within an epoch, only increase.
 ///
-/// The gate moves with what it admits, never with what the election knows: the last round of an old leader is still
-/// taken while the new one, already elected, has published nothing. That makes a handover free of gaps.
+/// The gate moves with the admitted rounds and is independent of the election: the last round of an
+/// old leader is still accepted while its elected successor has not published yet. This makes
+/// handovers free of gaps.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct EpochGate {
     floor: u64,
@@ -14,7 +15,7 @@ pub struct EpochGate {
 }
 
 impl EpochGate {
-    /// A gate that has admitted nothing and refuses terms below `floor`.
+    /// Creates an empty gate that refuses terms below `floor`.
     pub fn new(floor: u64) -> Self {
         Self {
             floor,
@@ -22,11 +23,11 @@ impl EpochGate {
         }
     }
 
-    /// Takes round `round` of `epoch`, or refuses it.
+    /// Admits round `round` of `epoch`, or refuses it.
     ///
     /// # Errors
-    /// [`RejectReason::Superseded`] when a later epoch was admitted, or this or a later round of the same; the gate is
-    /// unchanged.
+    /// Returns [`RejectReason::Superseded`] if a later epoch was admitted, or this or a later round
+    /// of the same epoch. The gate is unchanged in this case.
     pub fn admit(&mut self, epoch: &Epoch, round: u64) -> Result<(), RejectReason> {
         let newer = match &self.latest {
             None => epoch.term >= self.floor,

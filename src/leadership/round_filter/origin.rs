@@ -1,13 +1,14 @@
-//! Proof that a round is of the aggregator that it names.
+//! Proof that a round was published by the aggregator named in it.
 
 use crate::model::names::NodeName;
 
 /// Proof of a round's aggregator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Origin {
-    /// It came over the aggregator's own broker, has its signature, or is the node's own.
+    /// It arrived over the aggregator's own broker, has its signature, or is the node's own.
     Proven,
-    /// Its own word only: in a cell without certificates, or at a broker of others.
+    /// Only claimed in the message itself: in a cell without certificates, or over another node's
+    /// broker.
     Claimed,
 }
 
@@ -16,18 +17,20 @@ pub enum Origin {
 pub enum SignatureState {
     /// The aggregator signed this round.
     Valid,
-    /// None, a wrong one, or one of a node whose certificate is not known.
+    /// There is no signature, a wrong signature, or a signature of a node whose certificate is not
+    /// available.
     Invalid,
     /// This node cannot verify signatures: it has no certificates, or no membership.
     Unverifiable,
 }
 
 impl Origin {
-    /// Origin of a round that came over a broker; `None` if the round is refused.
+    /// Origin of a round that arrived over a broker; `None` if the round is refused.
     ///
-    /// `broker` is the node whose certificate the broker has proven, if any. An aggregator's own broker lets nobody else
-    /// publish rounds. The broker of another node may: only what the aggregator signed is taken from it. `signature` is
-    /// asked for where it matters.
+    /// `broker` is the node whose certificate the broker has proven, if any. An aggregator's own
+    /// broker lets only the aggregator publish rounds. Another node's broker may let other clients
+    /// publish them, so only rounds signed by the aggregator are accepted from it. `signature` is
+    /// only called when it is needed.
     pub fn of(
         aggregator: Option<&NodeName>,
         broker: Option<&NodeName>,

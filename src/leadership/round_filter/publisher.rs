@@ -1,14 +1,15 @@
-//! The rule of a node's own broker: who may publish for all.
+//! The rule of a node's own broker: which nodes may publish for the whole cell.
 
 use crate::leadership::timers::FAREWELL_TIME;
 use crate::leadership::view::Leadership;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// Rule by which a broker passes maps, verdicts and reputations on.
+/// Rule by which a broker forwards maps, verdicts and reputations.
 ///
-/// The leader may publish. A leader before it may for [`FAREWELL_TIME`]: its last round is under way when its successor
-/// is known already. While nobody is known to lead anyone may, and receivers decide.
+/// The leader may publish. A former leader may publish for another [`FAREWELL_TIME`], because its
+/// last round may still be in transit when its successor is elected. While there is no leader every
+/// node may publish, and receivers decide.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct PublisherFilter {
     last: Option<Publisher>,

@@ -1,4 +1,4 @@
-//! Detection of rounds that waited in a queue, whatever the clock of their sender says.
+//! Detection of rounds that waited in a queue, independent of the sender's clock.
 
 use std::time::Duration;
 
@@ -10,26 +10,26 @@ use crate::leadership::timers::{
 use crate::model::epoch::Epoch;
 use crate::model::time::Timestamp;
 
-/// Filter that tells rounds that have just been made from those that waited.
+/// Filter that separates fresh rounds from rounds that waited in a queue.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct StalenessFilter {
-    /// The least delay of the present leader, to which the delay of its rounds is compared, and before it those of leaders
-    /// whose rounds came in the last [`LEADER_DELAY_MEMORY`]. A leader that leads again has the same clock: leaders that
-    /// alternate make no old round fresh.
+    /// Least delays of the current leader, to which the delay of its rounds is compared, and of
+    /// leaders whose rounds arrived within the last [`LEADER_DELAY_MEMORY`]. A leader that leads
+    /// again has the same clock, so alternating leaders don't make an old round look fresh.
     delays: Vec<(Epoch, LeadersDelay)>,
     /// Arrival of the last round; before any, the time of the start.
     newest_at: Timestamp,
-    /// Arrival of the first round after none had come for [`MAX_ROUND_AGE`].
+    /// Arrival of the first round after a gap of [`MAX_ROUND_AGE`].
     resumed_at: Option<Timestamp>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct LeadersDelay {
     least: MinimumDelay,
-    /// Delay on which rounds agree that seem to have waited, or of which nobody knows: the leader's clock may have been
-    /// set.
+    /// Consistent delay of rounds that seem to have waited, or of a leader whose delay has not been
+    /// measured: the leader's clock may have been set.
     candidate: Option<LiveStream>,
-    /// True if the least delay is that of rounds that did not wait.
+    /// True if the least delay was measured on rounds that did not wait.
     is_learnt: bool,
     /// True if the least delay is only a bound, until the rounds prove to be live.
     is_bound: bool,
@@ -61,7 +61,7 @@ impl LeadersDelay {
         Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs())
     }
 
-    /// Takes a round; returns how long it waited, as far as is known.
+    /// Processes a round; returns how long it waited, as far as can be determined.
     fn observe(&mut self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
         let (last_fused_at, last_received_at) =
             std::mem::replace(&mut self.last, (fused_at, received_at));
@@ -75,8 +75,9 @@ impl LeadersDelay {
             Duration::ZERO
         };
         self.is_learnt |= self.live_for >= LIVE_STREAM_TIME;
-        // A later round with an earlier stamp: the leader's clock was set back. It was made after the last one, so it has
-        // waited for no longer than that, and the time since.
+        // A later round with an earlier stamp: the leader's clock was set back. The round was made
+        // after the previous one, so it has waited no longer than the previous round plus the time
+        // since.
         let longest_wait = self.last_waited + came_in;
         let delay_us = received_at.micros_from(fused_at);
         if fused_at < last_fused_at && longest_wait <= MAX_ROUND_WAIT {
@@ -105,14 +106,15 @@ impl LeadersDelay {
     }
 }
 
-/// Maximum number of leaders whose delays are remembered; the one whose rounds came longest ago is forgotten.
+/// Maximum number of leaders whose delays are stored; the leader whose rounds arrived longest ago
+/// is removed first.
 const MAX_LEADERS: usize = 8;
 
 /// Change of delay within which the rounds of a leader whose clock was set agree.
 const TOLERANCE_US: i64 = 250_000;
 
 impl StalenessFilter {
-    /// A filter of a node that starts: nothing can have waited for it before.
+    /// Creates the filter of a node that starts; rounds cannot have waited for it before that.
     pub fn new(now: Timestamp) -> Self {
         Self {
             delays: Vec::new(),
@@ -121,18 +123,21 @@ impl StalenessFilter {
         }
     }
 
-    /// True if a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
-    /// stopped, or a link that was, finds the rounds of that time waiting.
+    /// True if a round of `epoch`, whose order is right, spent at most [`MAX_ROUND_WAIT`] in
+    /// queues. After a stall of the node or of a link, the rounds of that time are waiting in the
+    /// queue.
     ///
-    /// The first round of a leadership is fresh: its clock is not known. After a time without rounds, since the start too,
-    /// it is not, because it may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
+    /// The first round of a leadership counts as fresh, because the delay of its clock has not been
+    /// measured. After a gap without rounds, including the time since the start, a round may have
+    /// waited; then the stream first has to be live for [`LIVE_STREAM_TIME`].
     pub fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
         let has_resumed =
             received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE;
         if has_resumed {
             self.resumed_at = Some(received_at);
         }
-        // A delay that was not learnt before a silence is none after it: rounds that waited may have begun it.
+        // A delay that was not fully measured before a gap is not used after it: it may stem from
+        // rounds that waited.
         self.delays.retain(|(of, delay)| {
             let is_recent = || received_at.since(delay.last.1) <= LEADER_DELAY_MEMORY;
             (delay.is_learnt || !has_resumed) && (of == epoch || is_recent())
@@ -144,7 +149,8 @@ impl StalenessFilter {
         let known = known
             .map(|at| self.delays.remove(at))
             .filter(|(of, delay)| {
-                // A clock that was set while another node led says nothing about the delay.
+                // A clock that was set while another node led provides no information about the
+                // delay.
                 of == epoch || delay.distance(fused_at, received_at) <= LEADER_DELAY_MEMORY
             });
         let known = known.map(|(_, delay)| delay);
@@ -243,7 +249,8 @@ mod tests {
         );
         let mut filter = StalenessFilter::new(ms(0));
         assert!(filter.is_fresh(&edge, ms(0), ms(1)));
-        // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
+        // After a stall of eleven seconds, the old leader emits one more round, followed by its
+        // successor's rounds.
         assert!(filter.is_fresh(&edge, ms(11_000), ms(11_000)));
         let waiting = (5..110)
             .filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + 3 * n)))
@@ -278,7 +285,8 @@ mod tests {
         );
         let made = |n: u64| ms(100 * n).shifted(if n < 30 { 0 } else { -5_000_000 });
         assert!((0..20).all(|n| filter.is_fresh(&epoch, made(n), ms(100 * n + 2))));
-        // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst of them.
+        // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst
+        // of them.
         let fresh: Vec<_> = (20..50)
             .filter(|n| filter.is_fresh(&epoch, made(*n), ms(5002)))
             .collect();
@@ -354,7 +362,8 @@ mod tests {
             )
         };
         assert!((0..20).all(|n| is_fresh(100 * n, 0, 2)));
-        // Nothing tells how long the first of them waited. Once they are known to be live, they may be late again.
+        // The waiting time of the first rounds cannot be determined. Once the stream is live,
+        // rounds may be late again.
         assert!((27..40).all(|n| is_fresh(100 * n, 5, 2)));
         assert!((40..60).all(|n| is_fresh(100 * n, 5, 2 + 600 * (n % 2))));
     }
@@ -371,7 +380,8 @@ mod tests {
             StalenessFilter::new(ms(0)),
         );
         assert!((0..20).all(|round| filter.is_fresh(&old, ms(100 * round), ms(100 * round + 2))));
-        // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone passed other checks.
+        // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone
+        // passed other checks.
         assert!((20..41).all(|round| !filter.is_fresh(&new, ms(100 * round), ms(5000))));
         assert!(
             !filter.is_fresh(&new, ms(5060), ms(6100)),

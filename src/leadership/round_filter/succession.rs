@@ -1,7 +1,8 @@
-//! The order of leaderships on one topic: whose messages are accepted beside, before and after the elected leader's.
+//! The order of leaderships on one topic: which messages of other nodes are accepted before, during
+//! and after the elected leader's term.
 //!
-//! A superseded leader is refused, and so is one that was not elected. Nobody is refused for good: word of an election may
-//! be lost, and who reaches a broker may forge any epoch.
+//! A superseded leader is refused, and so is a leader that was not elected. No refusal is
+//! permanent: election messages can be lost, and any client of a broker can forge an epoch.
 
 use std::time::Duration;
 
@@ -12,36 +13,40 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
-/// Number of terms above the highest known one that the next leader may use: a restarted node skips the term that it may
-/// have used before.
+/// Number of terms above the highest seen term that the next leader may use: a restarted node skips
+/// the term that it may have used before.
 const TERMS_AHEAD: u64 = 2;
 
-/// Number of rounds by which the standby that takes over may be ahead of the elected leader's last. A standby that still
-/// leads on its own counts its own rounds, and is to be told to follow.
+/// Number of rounds by which a standby that takes over may be ahead of the elected leader's last
+/// round. A standby that kept leading on its own has counted further; it has to follow the elected
+/// leader instead.
 const MAX_ROUNDS_AHEAD: u64 = 16;
 
-/// Most rounds that a leader publishes in a time: one each millisecond.
+/// Maximum number of rounds that a leader publishes in `time`: one per millisecond.
 fn max_rounds_in(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Filter of one topic: admits messages in the order of epoch, aggregator and round, of those that may lead.
+/// Filter of one topic: admits messages of possible leaders in the order of epoch, aggregator and
+/// round.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SuccessionFilter {
     gate: EpochGate,
-    /// True if the topic's last message is retained: any term is believed while nobody is known to lead, and the first message
-    /// may be of any age.
+    /// True if the topic's last message is retained. In this case any term is accepted while there
+    /// is no leader, and the first message may have any age.
     is_retained: bool,
     /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
     /// True if the only admitted message may have been retained, and be of any age.
     newest_is_retained: bool,
     elected: Option<Elected>,
-    /// Time since when others than the elected are admitted, or it is not.
+    /// Start of the current period in which messages of other nodes are admitted, or in which the
+    /// elected leader's messages are not.
     others_since: Option<Timestamp>,
-    /// The elected leader beside which others have used up their credit, also in terms that it renews.
+    /// The elected leader during whose leadership other nodes have used up their credit, including
+    /// terms that it renews.
     overruled: Option<NodeName>,
-    /// The publisher of a term that the election has not heard of while nobody is known to lead.
+    /// The publisher of a term that the election has not seen, while there is no leader.
     stranger: Option<Stranger>,
 }
 
@@ -63,8 +68,9 @@ struct Stranger {
 }
 
 impl Elected {
-    /// True if its standby may have taken over, or itself gone on in a later term, as after a split has healed. Leaders of
-    /// the same term are rivals that began at the same time.
+    /// True if the leader's standby may have taken over, or the leader itself may have continued in
+    /// a later term, for example after a split has healed. Leaders of the same term are rivals that
+    /// began at the same time.
     fn is_succeeded_by(&self, epoch: &Epoch, round: u64, standby: Option<&NodeName>) -> bool {
         let goes_on = |last| round > last && round - last <= MAX_ROUNDS_AHEAD;
         let is_next = standby == Some(&epoch.leader) || self.epoch.leader == epoch.leader;
@@ -73,8 +79,9 @@ impl Elected {
 }
 
 impl SuccessionFilter {
-    /// A filter that refuses terms below `floor` at first. While nobody is known to lead it also refuses terms below the
-    /// highest known one, or more than `TERMS_AHEAD` above it, until they were published for a while.
+    /// Creates a filter that refuses terms below `floor` at first. While there is no leader it also
+    /// refuses terms below the highest seen term, or more than `TERMS_AHEAD` above it, until they
+    /// have been published for a while.
     pub fn new(floor: u64) -> Self {
         Self {
             gate: EpochGate::new(floor),
@@ -88,8 +95,9 @@ impl SuccessionFilter {
         }
     }
 
-    /// A filter for a topic whose last message is retained. It believes any term from `floor` on while nobody is known to lead, and
-    /// the second message may be many rounds later than the first.
+    /// Creates a filter for a topic whose last message is retained. While there is no leader it
+    /// accepts any term from `floor` on, and the second message may be many rounds later than the
+    /// first.
     pub fn of_retained(floor: u64) -> Self {
         Self {
             is_retained: true,
@@ -97,10 +105,10 @@ impl SuccessionFilter {
         }
     }
 
-    /// Takes round `round` of `epoch`, or refuses it, given what the election says.
+    /// Admits round `round` of `epoch`, or refuses it, based on the election's leadership.
     ///
     /// # Errors
-    /// The reason for which it is refused; never [`Refusal::Stale`].
+    /// Returns the reason for the refusal, which may be any reason except [`Refusal::Stale`].
     pub fn admit(
         &mut self,
         epoch: &Epoch,
@@ -124,8 +132,9 @@ impl SuccessionFilter {
         match elected {
             Some(elected) if elected == epoch => self.admit_elected(epoch, round, received_at),
             Some(elected) => {
-                // A leader has no successor before it yields. It is to hear of a later leadership by the election: its own
-                // rounds go on until then, and would go back in epoch.
+                // A leader has no successor before it yields. It must discover a later leadership
+                // through the election: its own rounds continue until then, and would be of a lower
+                // epoch.
                 let is_staying = leadership.is_leading() && !leadership.is_yielding;
                 let standby = leadership.standby.as_ref().filter(|_| !is_staying);
                 self.admit_other(epoch, round, received_at, elected, standby)
@@ -137,11 +146,11 @@ impl SuccessionFilter {
         }
     }
 
-    /// True if an epoch that nobody vouches for is not to be believed yet.
+    /// True if an unconfirmed epoch must not be accepted yet.
     ///
-    /// The election hears of terms from those who know the cell's key, at the latest when the next leader beats, and it
-    /// knows of a term that is over. Without any election only who publishes on and on is believed, and of several the
-    /// first.
+    /// The election receives terms only from nodes with the cell's key, at the latest with the next
+    /// leader's beats, and tracks terms that are over. Without election state, the filter accepts
+    /// the first publisher that keeps publishing for [`SUCCESSOR_CREDIT`].
     fn is_strange(&mut self, epoch: &Epoch, known_term: u64, received_at: Timestamp) -> bool {
         if self.is_retained {
             return false;
@@ -172,8 +181,8 @@ impl SuccessionFilter {
         }
     }
 
-    /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next
-    /// elected.
+    /// The elected leader is admitted even after another node with a later epoch, unless that node
+    /// is likely to be elected next.
     fn admit_elected(
         &mut self,
         epoch: &Epoch,
@@ -235,7 +244,7 @@ impl SuccessionFilter {
         Ok(())
     }
 
-    /// `may_lead` says that nobody else is known to lead.
+    /// `may_lead` is true if there is no other leader.
     fn admit_in_order(
         &mut self,
         epoch: &Epoch,
@@ -307,7 +316,8 @@ mod tests {
         Timestamp(ms * 1000)
     }
 
-    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival changes them.
+    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival
+    /// changes them.
     #[test]
     fn a_retained_message_may_be_much_older_than_the_next_and_no_other_may() {
         let elected = epoch(7, "edge");
@@ -425,7 +435,8 @@ mod tests {
         );
     }
 
-    /// The standby took over while the leader was cut off. Its rounds come again before word of its election.
+    /// The standby took over while the leader was cut off. The standby's rounds arrive before the
+    /// election's messages do.
     #[test]
     fn a_leader_takes_no_round_of_another_beside_its_own_before_it_yields() {
         let (own, next) = (epoch(7, "edge"), epoch(8, "euclid"));

@@ -7,8 +7,9 @@ use super::*;
 /// One centimetre and less.
 const TOLERANCE_M: f64 = 1e-4;
 
-/// Origins, positions in the frame, and the same in latitude, longitude and height by PROJ:
-/// `+proj=pipeline +step +inv +proj=topocentric +lat_0=… +lon_0=… +h_0=… +step +inv +proj=cart`, ellipsoid WGS84.
+/// Origins, positions in the frame, and these positions as latitude, longitude and height by PROJ:
+/// `+proj=pipeline +step +inv +proj=topocentric +lat_0=… +lon_0=… +h_0=… +step +inv +proj=cart`,
+/// ellipsoid WGS84.
 const BY_PROJ: [([f64; 3], [f64; 3], [f64; 3]); 20] = [
     (
         [52.2296756, 21.0122287, 113.0],
@@ -151,7 +152,7 @@ fn positions_within_five_kilometres_are_those_of_proj() {
     for ([latitude, longitude, height], [x, y, z], by_proj) in BY_PROJ {
         let (origin, by_proj) = (at(latitude, longitude, height), position(by_proj));
         let there = origin.to_wgs84(x, y, z);
-        // Longest degree: what is near by it is near.
+        // The longest degree, so that a point that is near in degrees is also near in metres.
         let degree_m = 111_700.0;
         let off = [
             (there.latitude_deg - by_proj.latitude_deg) * degree_m,
@@ -218,7 +219,8 @@ fn a_heading_is_clockwise_from_the_north_of_where_the_vehicle_is() {
             "{turned:?}"
         );
     }
-    // 68 km to the east, north is 0.8° off; who drives there by the compass drives so in the map.
+    // 68 km to the east, north is 0.8° off; a compass course there corresponds to this heading in
+    // the map.
     let there = origin.pose_to_map(&pose(52.2, 22.0, 0.0)).unwrap();
     let ahead = origin.pose_to_map(&pose(52.2001, 22.0, 0.0)).unwrap();
     let driven = ahead.position - there.position;

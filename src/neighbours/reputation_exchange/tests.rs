@@ -21,7 +21,8 @@ fn counts(correct: u64, incorrect: u64) -> CellCounts {
 struct Retained(BTreeMap<(NodeName, NodeName), CellReputation>);
 
 impl Retained {
-    /// Carries out what a leader does now; returns filters that it subscribes to and ends, and messages.
+    /// Carries out a leader's next steps; returns the filters that it subscribes to and
+    /// unsubscribes from, and its messages.
     fn serve(
         &mut self,
         exchange: &mut ReputationExchange,
@@ -61,7 +62,7 @@ impl Retained {
     }
 }
 
-/// The cells whose word is news; panics if nothing is due.
+/// The cells with news; panics if there is no news due.
 fn cells_in_news(exchange: &mut ReputationExchange, now: Timestamp) -> Vec<String> {
     let news = exchange.take_news(now).expect("news are due");
     news.cells().into_iter().map(NodeName::to_string).collect()
@@ -230,7 +231,8 @@ fn without_a_connection_the_latest_counts_wait_and_those_with_most_votes_are_kep
     assert_eq!(region.of("v1123", "a"), Some((11_230, 0)));
 }
 
-/// What is not acknowledged by its return is sent again, and a broker that has lost all is told again.
+/// A message that does not come back is sent again, and a broker that has lost all messages gets
+/// them again.
 #[test]
 fn a_message_that_is_lost_is_repeated() {
     let mut exchange = ReputationExchange::new(name("a"));
@@ -356,7 +358,7 @@ fn a_region_that_answers_late_loses_nothing() {
     };
     assert_eq!(sent(&mut exchange, 0), None);
     let message = sent(&mut exchange, 3).unwrap();
-    // The retained message comes first, then the one that has replaced it.
+    // The retained message arrives first, then the message that replaced it.
     exchange.hear(&counts(400, 7).message(name("a"), euclid.clone()), at(4));
     exchange.hear(&message, at(4));
     assert_eq!(

@@ -11,7 +11,8 @@ use crate::pace::grouping::{Place, VehicleItems};
 use crate::perception::landmark::LandmarkCandidate;
 use crate::wire::PerceivedObject;
 
-/// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration order.
+/// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration
+/// order.
 impl Place {
     pub(super) fn of(candidate: &LandmarkCandidate) -> Self {
         if candidate.is_vacancy_sign {
@@ -160,7 +161,8 @@ impl VehicleBelief {
         (self.places, self.beliefs) = all.into_iter().unzip();
     }
 
-    /// Drops beliefs that were last observed before `limit`; returns the time of the oldest one left, if any is.
+    /// Drops beliefs that were last observed before `limit`; returns the time of the oldest one
+    /// left, if any is.
     pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
         if self.oldest_seen.is_some_and(|oldest| oldest < limit) {
             let mut beliefs = self.beliefs.iter();

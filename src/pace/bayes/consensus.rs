@@ -1,4 +1,5 @@
-//! Consensus about one place: the vehicles' log-odds added up, and the weighted mean of their positions.
+//! Consensus about one place: the vehicles' log-odds added up, and the weighted mean of their
+//! positions.
 
 use nalgebra::{Point2, Vector2};
 use smallvec::SmallVec;
@@ -15,7 +16,6 @@ pub(super) struct LabelScores<'a> {
     labels: SmallVec<[(&'a Label, f64); 4]>,
 }
 
-/// The agreed label.
 pub(super) struct AgreedLabel<'a> {
     pub(super) label: &'a Label,
     pub(super) posterior: f64,
@@ -84,7 +84,8 @@ pub(super) struct WeightedMean {
 }
 
 impl WeightedMean {
-    /// Adds a position; its errors have the covariance plus an independent standard deviation of `floor_m`.
+    /// Adds a position; its errors have the covariance plus an independent standard deviation of
+    /// `floor_m`.
     pub(super) fn add(&mut self, position: &Point2<f64>, covariance: &Covariance, floor_m: f64) {
         let Covariance { xx, xy, yy } = *covariance + Covariance::isotropic(floor_m);
         let per_determinant = 1.0 / (xx * yy - xy * xy);

@@ -1,4 +1,4 @@
-//! Known locations in a configuration file.
+//! Landmarks in a configuration file.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,7 +9,7 @@ use super::{Landmark, Synonym, VacancySign};
 use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
 
-/// One known location.
+/// One landmark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LandmarkConfig {
@@ -19,14 +19,14 @@ pub struct LandmarkConfig {
     pub x_m: f64,
     /// Position of an object in metres north.
     pub y_m: f64,
-    /// Direction in degrees, counter-clockwise from east, from which an object here can be read. Default: from all
-    /// around.
+    /// Direction in degrees, counter-clockwise from east, from which an object here can be read.
+    /// Default: from all around.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub facing_deg: Option<f64>,
-    /// A fixed sign that is in view while the location is empty. Default: none.
+    /// A fixed sign that is in view while the location is empty. Default: no sign.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vacancy: Option<VacancyConfig>,
-    /// Labels that count as another one here, such as `vase = "sports ball"`. Default: none.
+    /// Labels that count as another one here, such as `vase = "sports ball"`. Default: no synonyms.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
 }
@@ -61,7 +61,8 @@ pub struct VacancyConfig {
 }
 
 impl LandmarkConfig {
-    /// A location that can be read from all around, without a sign or other labels; `x_m` east and `y_m` north.
+    /// A location that can be read from all around, without a sign or other labels; `x_m` east and
+    /// `y_m` north.
     pub fn at(id: impl Into<LandmarkId>, x_m: f64, y_m: f64) -> Self {
         Self {
             id: id.into(),
@@ -76,7 +77,7 @@ impl LandmarkConfig {
     /// Checks one location.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_label("id", &self.id)?;
         check_synonyms(&self.synonyms)?;
@@ -94,7 +95,7 @@ impl LandmarkConfig {
     /// Checks all locations of a cell and that their names differ.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the location by its position in the list.
+    /// Returns a [`ConfigError`] that names the location by its position in the list.
     pub fn validate_all(locations: &[Self]) -> Result<(), ConfigError> {
         let mut ids = BTreeSet::new();
         for (index, location) in locations.iter().enumerate() {

@@ -12,8 +12,9 @@ pub(super) struct GridPoint {
     pub(super) has_sign: bool,
 }
 
-/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets, so that a query reads one
-/// contiguous range of memory for each row and successive queries of a vehicle are near each other.
+/// Points grouped by cell, and cells by bucket. The cells of a row have successive buckets, so that
+/// a query reads one contiguous range of memory for each row and successive queries of a vehicle
+/// are near each other.
 #[derive(Debug, Clone)]
 pub(super) struct Grid {
     cell_m: f64,
@@ -23,12 +24,13 @@ pub(super) struct Grid {
     ends: Vec<u32>,
 }
 
-/// Multiplier that spreads the rows over the buckets: the fraction of the golden ratio in 64 bits (Knuth, "The Art of
-/// Computer Programming", volume 3, section 6.4).
+/// Multiplier that spreads the rows over the buckets: the fraction of the golden ratio in 64 bits
+/// (Knuth, "The Art of Computer Programming", volume 3, section 6.4).
 const ROW_STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 
 impl Grid {
-    /// Groups the points into cells of `cell_m` metres; a query visits one to four cells for radii up to half of that.
+    /// Groups the points into cells of `cell_m` metres; a query visits one to four cells for radii
+    /// up to half of that.
     pub(super) fn new(points: impl IntoIterator<Item = GridPoint>, cell_m: f64) -> Self {
         let mut points: Vec<_> = points.into_iter().collect();
         let buckets = (2 * points.len()).next_power_of_two();
@@ -76,7 +78,8 @@ impl Grid {
         .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
     }
 
-    /// The points in the buckets of a cell and of the `more` next ones of its row, with all others in these buckets.
+    /// The points in the buckets of a cell and of the `more` next cells of its row, including all
+    /// other points in these buckets.
     fn row_cells(
         &self,
         first: i32,

@@ -10,7 +10,8 @@ use super::grid::{Grid, GridPoint};
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, LandmarkId};
 
-/// Landmarks in configuration order with a spatial index of the positions of objects and vacancy signs.
+/// Landmarks in configuration order with a spatial index of the positions of objects and vacancy
+/// signs.
 #[derive(Debug, Clone)]
 pub struct LandmarkIndex {
     landmarks: Vec<Landmark>,
@@ -19,7 +20,8 @@ pub struct LandmarkIndex {
     by_id: HashMap<LandmarkId, usize>,
     objects: Grid,
     vacancy_signs: Grid,
-    /// Corners of the box around all positions, west-south and east-north; without landmarks, the wrong way around.
+    /// Corners of the box around all positions, west-south and east-north; without landmarks, the
+    /// wrong way around.
     corners: [Point2<f64>; 2],
 }
 
@@ -41,8 +43,8 @@ pub struct LandmarkGate {
     pub radius_m: f64,
     /// Largest distance in standard deviations.
     pub sigmas: f64,
-    /// Standard deviation in metres that is added to every reported one. It covers errors that the vehicle cannot report:
-    /// those of the map and of its own pose.
+    /// Standard deviation in metres that is added to every reported one. It covers errors that the
+    /// vehicle cannot report: errors of the map and of the vehicle's own pose.
     pub floor_m: f64,
 }
 
@@ -95,7 +97,8 @@ impl LandmarkIndex {
         self.by_id.get(id).copied()
     }
 
-    /// The same for ids that mostly come in configuration order: `expected` is tried first.
+    /// As `position_of`, for ids that mostly arrive in configuration order: `expected` is tried
+    /// first.
     pub fn position_near(&self, id: &LandmarkId, expected: usize) -> Option<usize> {
         if self.ids.get(expected) == Some(id) {
             Some(expected)
@@ -104,14 +107,16 @@ impl LandmarkIndex {
         }
     }
 
-    /// Landmarks whose object position is within `radius_m` of a point in metres, in no particular order.
+    /// Landmarks whose object position is within `radius_m` of a point in metres, in no particular
+    /// order.
     pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
         self.objects
             .within(*point, radius_m)
             .map(|(near, _)| near.landmark as usize)
     }
 
-    /// True if a point in metres is at most `margin_m` and their extent away from the landmarks, along each axis.
+    /// True if a point in metres is at most `margin_m` and their extent away from the landmarks,
+    /// along each axis.
     pub fn is_around(&self, point: &Point2<f64>, margin_m: f64) -> bool {
         let [low, high] = self.corners;
         let margin = (high - low).add_scalar(margin_m);
@@ -120,8 +125,8 @@ impl LandmarkIndex {
 
     /// The landmark within the gate at the smallest Mahalanobis distance from a detection.
     ///
-    /// A detection with the label of a landmark's vacancy sign is compared with the sign's position, any other with the
-    /// position of objects.
+    /// A detection with the label of a landmark's vacancy sign is compared with the sign's
+    /// position, any other with the position of objects.
     pub fn best(
         &self,
         label: &Label,
@@ -129,7 +134,8 @@ impl LandmarkIndex {
         covariance: &Covariance,
         gate: &LandmarkGate,
     ) -> Option<LandmarkCandidate> {
-        // A fold and not `min_by`, which takes the first candidate apart and thus prevents plain loops.
+        // A fold and not `min_by`, which takes the first candidate apart and thus prevents plain
+        // loops.
         self.candidates(label, *point, *covariance, *gate).fold(
             None,
             |best, candidate| match best {

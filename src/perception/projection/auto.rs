@@ -1,4 +1,5 @@
-//! Ranging by all that a box without corners tells: its foot on the ground, its height, and its head.
+//! Ranging by all information in a box without corners: its foot on the ground, its height, and its
+//! head.
 
 use super::ground::{self, HalfDepth};
 use super::{Cut, LineOfSight, ObjectSize, Projection, ProjectionError, box_height, box_width};
@@ -6,9 +7,10 @@ use crate::model::detection::Detection;
 
 /// The line of sight to the middle of an object on the ground.
 ///
-/// Foot and height are weighted by their covariance. If they contradict each other, the object does not stand on the
-/// ground, or the ground is not level, and its height alone counts. A head above the image leaves the foot. A foot below it
-/// leaves the head or the width, whichever says more.
+/// Foot and height are weighted by their covariance. If they contradict each other, the object does
+/// not stand on the ground, or the ground is not level, and its height alone counts. If the head is
+/// above the image, only the foot is used. If the foot is below the image, the head or the width is
+/// used, whichever is more precise.
 pub(super) fn line_of_sight(
     detection: &Detection,
     cut: Cut,

@@ -9,7 +9,8 @@ use super::level_sight::LevelSight;
 use super::{LineOfSight, ObjectSize, Projection};
 use crate::model::detection::BoundingBox;
 
-/// Similar triangles on the height. Of a level camera it is parallel to the image's columns: z = f_y · height / box height.
+/// Similar triangles on the height. Of a level camera it is parallel to the image's columns: z =
+/// f_y · height / box height.
 pub(super) fn line_of_sight(
     bounds: &BoundingBox,
     size: &ObjectSize,
@@ -28,8 +29,9 @@ pub(super) fn line_of_sight(
 
 /// The lines of sight to the foot and the head of an upright object.
 ///
-/// Its sides meet in the vanishing point of verticals. A point of the foot in column x is below one in column
-/// scale · x + shift of the head. So the foot is as wide as both its own edges and those below the head's leave it.
+/// Its sides meet in the vanishing point of verticals. A point of the foot in column x is below the
+/// point of the head in column scale · x + shift. The width of the foot is therefore limited both
+/// by its own edges and by the edges below the head.
 pub(super) fn foot_and_head(
     bounds: &BoundingBox,
     projection: &Projection,
@@ -68,10 +70,10 @@ pub(super) fn foot_and_head(
     (foot, head)
 }
 
-/// The middle of an upright object of known height, from the slopes to its foot and head.
+/// The middle of an upright object of given height, from the slopes to its foot and head.
 ///
-/// The foot is its near edge. The head is its near edge from below and its far edge from above, so that
-/// d = (height + half depth · (foot + |head|)) / (foot − head).
+/// The foot is its near edge. The head is its near edge from below and its far edge from above, so
+/// that d = (height + half depth · (foot + |head|)) / (foot − head).
 pub(super) fn upright(
     foot: &LevelSight,
     head: &LevelSight,

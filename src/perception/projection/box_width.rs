@@ -5,8 +5,8 @@ use nalgebra::Point2;
 use super::{LineOfSight, ObjectSize, Projection};
 use crate::model::detection::BoundingBox;
 
-/// An isosceles triangle with the width as its base and the camera at its tip: d = s / (2 tan(α/2)). The line of sight
-/// halves the angle between the bearings of the two edges.
+/// An isosceles triangle with the width as its base and the camera at its tip: d = s / (2
+/// tan(α/2)). The line of sight halves the angle between the bearings of the two edges.
 pub(super) fn line_of_sight(
     bounds: &BoundingBox,
     size: &ObjectSize,

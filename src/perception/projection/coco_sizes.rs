@@ -1,10 +1,12 @@
 //! Usual sizes of the 80 kinds of objects of COCO, for labels without a configured size.
 //!
-//! Sources by group. *Road*: mean sizes of the annotated boxes of KITTI (Geiger et al., CVPR 2012) and nuScenes (Caesar et
-//! al., CVPR 2020). *People*: NCD-RisC, "Height and body-mass index trajectories", Lancet 2020, adults with shoes, and
-//! children in the spread. *Standards*: lenses of 0.2 and 0.3 m (EN 12368), stop signs of 0.6 to 0.9 m (Vienna Convention,
-//! MUTCD), hydrants (AWWA C502), balls, bats and rackets by the rules of their sports. *Estimates*: animals by common
-//! breeds at the back or head, furniture and things of a household as sold; the spread covers how they lie and are held.
+//! Sources by group. *Road*: mean sizes of the annotated boxes of KITTI (Geiger et al., CVPR 2012)
+//! and nuScenes (Caesar et al., CVPR 2020). *People*: NCD-RisC, "Height and body-mass index
+//! trajectories", Lancet 2020, adults with shoes, and children in the spread. *Standards*: lenses
+//! of 0.2 and 0.3 m (EN 12368), stop signs of 0.6 to 0.9 m (Vienna Convention, MUTCD), hydrants
+//! (AWWA C502), balls, bats and rackets by the rules of their sports. *Estimates*: animals by
+//! common breeds at the back or head, furniture and things of a household as sold; the spread
+//! covers how they lie and are held.
 
 use super::ObjectSize;
 

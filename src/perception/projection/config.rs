@@ -1,4 +1,4 @@
-//! Settings of projection: the way of ranging, object sizes and uncertainties.
+//! Settings of projection: the method of ranging, object sizes and uncertainties.
 
 use std::collections::BTreeMap;
 
@@ -8,26 +8,29 @@ use super::coco_sizes;
 use crate::config::{ConfigError, check_range, config_section};
 use crate::model::names::Label;
 
-/// The way to find the distance of a detection.
+/// The method of finding the distance of a detection.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
-    /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and [`Ranging::BoxHeight`],
-    /// weighted by their covariance where both hold; without the height of the camera, the latter alone.
+    /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and
+    /// [`Ranging::BoxHeight`], weighted by their covariance where both hold; without the height of
+    /// the camera, the latter alone.
     #[default]
     Auto,
-    /// From the four corners of a square target, at any yaw; the most exact. Detections without corners are ranged by
-    /// [`Ranging::BoxHeight`].
+    /// From the four corners of a square target, at any yaw; the most exact. Detections without
+    /// corners are ranged by [`Ranging::BoxHeight`].
     Corners,
     /// z = f_y · height / box height: exact for an upright object at any yaw.
     BoxHeight,
-    /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a width perpendicular to
-    /// the line of sight, too far for one that is turned away.
+    /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a
+    /// width perpendicular to the line of sight, too far for an object that is turned away.
     BoxWidth,
-    /// Where the foot of the box meets the ground: for objects that stand on level ground, with the camera's height known.
+    /// From the intersection of the foot of the box with the ground: for objects on level ground
+    /// and a camera of configured height.
     Ground,
-    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s / tan α with α spread
-    /// evenly over the columns, and bearings from the left edge of the image. `projection/paper.rs` explains them.
+    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s /
+    /// tan α with α spread evenly over the columns, and bearings from the left edge of the image.
+    /// `projection/paper.rs` explains them.
     Paper,
 }
 
@@ -46,12 +49,13 @@ pub struct ObjectSize {
     pub width_m: f64,
     /// Height in metres; the side of a square target.
     pub height_m: f64,
-    /// Length in metres, the horizontal extent across the width; default the width. It matters where the ground gives the
-    /// distance.
+    /// Length in metres, the horizontal extent across the width; default the width. It matters if
+    /// the ground gives the distance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub length_m: Option<f64>,
-    /// Relative standard deviation of sizes of this kind and of the focal length together; default 0.02. Too small
-    /// makes positions over-confident along the line of sight; too large makes them count less in fusion.
+    /// Relative standard deviation of sizes of this kind and of the focal length together; default
+    /// 0.02. Too small makes positions over-confident along the line of sight; too large makes them
+    /// count less in fusion.
     #[serde(default = "default_relative_sigma")]
     pub relative_sigma: f64,
 }
@@ -77,14 +81,14 @@ impl ObjectSize {
     }
 }
 
-/// Known sizes by label.
+/// Object sizes by label.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectSizes {
-    /// Size of labels that are not listed, such as decoded texts. Default none: labels of COCO have their usual sizes, and
-    /// others no position, unless the ground gives one.
+    /// Size of labels that are not listed, such as decoded texts. Default: no size. Labels of COCO
+    /// then have their usual sizes, and other labels have no position, unless the ground gives one.
     pub default: Option<ObjectSize>,
-    /// Sizes of listed labels; default none.
+    /// Sizes of listed labels; default empty.
     pub labels: BTreeMap<Label, ObjectSize>,
 }
 
@@ -100,7 +104,7 @@ impl ObjectSizes {
     /// Checks every size.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if let Some(size) = &self.default {
             size.validate().map_err(|e| e.within("default"))?;
@@ -115,25 +119,28 @@ impl ObjectSizes {
 config_section! {
     /// Settings of projection.
     pub struct ProjectionConfig {
-        /// The way of ranging; default `auto`: from corners, otherwise from the box's height and, if the camera's height
-        /// is known, the ground. `box_height` needs upright objects, `box_width` objects that face the camera, `ground`
-        /// objects on level ground; `paper` has the published formulas with their errors.
+        /// The method of ranging; default `auto`: from corners, otherwise from the box's height
+        /// and, if the camera's height is configured, the ground. `box_height` needs upright
+        /// objects, `box_width` objects that face the camera, `ground` objects on level ground;
+        /// `paper` has the published formulas with their errors.
         pub ranging: Ranging = Ranging::default();
-        /// True sizes of objects; default none but the usual ones of COCO's labels.
+        /// True sizes of objects; by default only the usual sizes of COCO's labels.
         pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
-        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
-        /// detectors 3 and more.
+        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach
+        /// 0.5, neural detectors 3 and more.
         pub pixel_sigma_px: f64 = 1.0, in 0.0 to 1e3;
         /// Standard deviation of the camera's heading in radians; default 0.01.
         pub heading_sigma_rad: f64 = 0.01, in 0.0 to std::f64::consts::PI;
-        /// Standard deviation of the camera's pitch and roll in radians; default 0.0175 (1°). It covers a mount that was
-        /// measured by hand and a road that is not level.
+        /// Standard deviation of the camera's pitch and roll in radians; default 0.0175 (1°). It
+        /// covers a mount that was measured by hand and a road that is not level.
         pub tilt_sigma_rad: f64 = 0.0175, in 0.0 to 1.0;
-        /// Standard deviation of the camera's height above the ground at the object in metres; default 0.02. Bumps count.
+        /// Standard deviation of the camera's height above the ground at the object in metres;
+        /// default 0.02. Bumps count.
         pub height_sigma_m: f64 = 0.02, in 0.0 to 1e3;
         /// Standard deviation of the camera's position in metres, each axis; default 0.005.
         pub position_sigma_m: f64 = 0.005, in 0.0 to 1e3;
-        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
+        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps
+        /// covariances away from zero.
         pub floor_m: f64 = 0.005, in 1e-6 to 1e3;
     }
 }

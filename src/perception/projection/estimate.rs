@@ -12,17 +12,18 @@ pub(super) struct Estimate {
     pub(super) errors: Errors,
 }
 
-/// Difference of two estimates in standard deviations above which one of them rests on a false assumption.
+/// Difference of two estimates in standard deviations above which one of the estimates must be
+/// based on a false assumption.
 pub(super) const CONFLICT_SIGMAS: f64 = 3.0;
 
 impl Estimate {
-    /// The estimate as far as it lies before the camera.
+    /// The estimate, if it lies in front of the camera.
     pub(super) fn in_front(self) -> Option<Self> {
         (self.distance_m > 0.0 && self.distance_m.is_finite()).then_some(self)
     }
 
-    /// The combination of least variance with another estimate of correlated errors (Bar-Shalom, Campo 1986, equation 8);
-    /// `None` if the two contradict each other.
+    /// The combination of least variance with another estimate of correlated errors (Bar-Shalom,
+    /// Campo 1986, equation 8); `None` if the two contradict each other.
     pub(super) fn combined_with(&self, other: &Self) -> Option<Self> {
         let difference = self.errors - other.errors;
         let variance = difference.norm_squared();
@@ -40,8 +41,8 @@ impl Estimate {
         })
     }
 
-    /// The line of sight at this distance, in the direction of `sight`; `middle_m` is the standard deviation of the middle
-    /// of the box from the middle of the object.
+    /// The line of sight at this distance, in the direction of `sight`; `middle_m` is the standard
+    /// deviation of the middle of the box from the middle of the object.
     pub(super) fn along(&self, sight: &LevelSight, middle_m: f64) -> LineOfSight {
         LineOfSight {
             bearing_rad: sight.bearing_rad,

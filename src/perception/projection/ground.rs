@@ -1,4 +1,5 @@
-//! Ranging by where the foot of the box meets the ground, with the height of the camera known.
+//! Ranging by the intersection of the foot of the box with the ground, for a camera of configured
+//! height.
 
 use super::error_sources::{Errors, Source};
 use super::estimate::Estimate;
@@ -20,7 +21,8 @@ pub(super) struct HalfDepth {
 }
 
 impl HalfDepth {
-    /// That of a rectangular footprint of length l and width w at an unknown yaw φ: (l |cos φ| + w |sin φ|) / 2.
+    /// Half depth of a rectangular footprint of length l and width w at an unknown yaw φ: (l |cos
+    /// φ| + w |sin φ|) / 2.
     pub(super) fn of_size(size: &ObjectSize) -> Self {
         use std::f64::consts::PI;
         let (width, length) = (size.width_m, size.length_m.unwrap_or(size.width_m));
@@ -33,7 +35,8 @@ impl HalfDepth {
         }
     }
 
-    /// That of an object of this size, or as deep as its box is wide where the foot is on the ground.
+    /// Half depth of an object of this size or, without a size, of an object that is as deep as its
+    /// box is wide when its foot is on the ground.
     pub(super) fn of(
         size: Option<&ObjectSize>,
         bounds: &BoundingBox,
@@ -51,8 +54,9 @@ impl HalfDepth {
         }
     }
 
-    /// Standard deviation in metres of the middle of a box from the middle of its object at this distance: the nearer side
-    /// looks larger. Of an object whose footprint the upper edge of the image cuts, any part may be in view.
+    /// Standard deviation in metres of the middle of a box from the middle of its object at this
+    /// distance: the nearer side looks larger. Of an object whose footprint the upper edge of the
+    /// image cuts, any part may be in view.
     pub(super) fn middle_sigma_m(
         &self,
         distance_m: f64,
@@ -74,7 +78,8 @@ impl HalfDepth {
         }
     }
 
-    /// The size of the object with the width that is seen at an unknown yaw, which is distributed as its depth is.
+    /// The size of the object with the width that is seen at an unknown yaw, which is distributed
+    /// as its depth is.
     pub(super) fn seen_width(&self, size: &ObjectSize) -> ObjectSize {
         ObjectSize {
             width_m: 2.0 * self.mean_m,
@@ -83,7 +88,7 @@ impl HalfDepth {
         }
     }
 
-    /// That of a flat object.
+    /// Half depth of a flat object.
     pub(super) fn flat() -> Self {
         Self {
             mean_m: 0.0,
@@ -92,7 +97,8 @@ impl HalfDepth {
     }
 }
 
-/// The middle of the object whose foot is on the ground; `None` without a foot clearly below the horizon.
+/// The middle of the object whose foot is on the ground; `None` without a foot clearly below the
+/// horizon.
 pub(super) fn from_foot(
     foot: &LevelSight,
     half: HalfDepth,
@@ -105,7 +111,8 @@ pub(super) fn from_foot(
     estimate.in_front()
 }
 
-/// The middle of the object whose head is as high as objects of its kind are; `None` for a head near the horizon.
+/// The middle of the object whose head is as high as objects of its kind are; `None` for a head
+/// near the horizon.
 pub(super) fn from_head(
     head: &LevelSight,
     size: &ObjectSize,
@@ -129,8 +136,9 @@ fn camera_height(projection: &Projection) -> Errors {
     errors
 }
 
-/// The distance at which a line of sight meets a plane `drop_m` below the camera: d = drop / slope. The slope's error is
-/// taken to second order, as the distance grows without bound towards the horizon.
+/// The distance at which a line of sight meets a plane `drop_m` below the camera: d = drop / slope.
+/// The slope's error is propagated to second order, because the distance grows without bound
+/// towards the horizon.
 fn on_plane(sight: &LevelSight, drop_m: f64, drop_errors: &Errors) -> Option<Estimate> {
     let distance_m = drop_m / sight.slope;
     let relative = sight.errors.norm() / sight.slope.abs();

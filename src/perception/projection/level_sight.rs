@@ -10,11 +10,12 @@ use super::error_sources::{Errors, Source};
 pub(super) struct LevelSight {
     /// Off the heading of the axis in radians, counter-clockwise positive.
     pub(super) bearing_rad: f64,
-    /// Standard deviation of the bearing in radians, without that of the heading.
+    /// Standard deviation of the bearing in radians, excluding the error of the heading.
     pub(super) turn_rad: f64,
     /// Tangent of the angle below the horizon.
     pub(super) slope: f64,
-    /// Distance along the line of sight that an object's half depth across the image's row takes on the ground.
+    /// Distance along the line of sight that an object's half depth across the image's row takes on
+    /// the ground.
     pub(super) depth_factor: f64,
     /// Changes of the slope.
     pub(super) errors: Errors,

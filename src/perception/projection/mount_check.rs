@@ -1,4 +1,4 @@
-//! Agreement of a camera's mount with what it sees: a camera that turns moves the horizon.
+//! Consistency of a camera's mount with its images: a camera that turns moves the horizon.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -14,16 +14,17 @@ use crate::model::time::Timestamp;
 const WINDOW: Duration = Duration::from_secs(60);
 /// Time between two frames that count: the same objects are in the frames between.
 const SAMPLE_PERIOD: Duration = Duration::from_millis(500);
-/// Largest number of boxes of a frame that count: a crowd says no more.
+/// Maximum number of boxes of a frame that are used: more boxes of a crowd add little information.
 const MAX_OF_FRAME: usize = 4;
 /// Least number of boxes that are compared.
 const MIN_BOXES: usize = 30;
 /// Least time between the first and the last of them.
 const MIN_TIME: Duration = Duration::from_secs(10);
-/// Labels of COCO that stand on the ground. Those with a listed size count as well; others may hang or lie on something.
+/// Labels of COCO that stand on the ground. Labels with a configured size count as well; other
+/// objects may hang or lie on something.
 const STANDING: [&str; 6] = ["person", "bicycle", "car", "motorcycle", "bus", "truck"];
-/// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one distance, a camera that has turned
-/// looks like objects that do not stand on the ground.
+/// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one
+/// distance, a camera that has turned looks like objects that do not stand on the ground.
 const MIN_SLOPE_RATIO: f64 = 1.25;
 /// Least share of the boxes that agree about the angle within two standard deviations.
 const MIN_AGREEMENT: f64 = 2.0 / 3.0;
@@ -39,7 +40,7 @@ struct FootOffset {
     sigma_rad: f64,
 }
 
-/// Recent boxes of upright objects of known size on the ground.
+/// Recent boxes of upright objects of configured size on the ground.
 #[derive(Debug, Clone, Default)]
 pub struct MountCheck {
     offsets: VecDeque<FootOffset>,
@@ -47,10 +48,11 @@ pub struct MountCheck {
 }
 
 impl MountCheck {
-    /// Takes the boxes of a frame, without distortion, with the edges that cut them.
+    /// Adds the boxes of a frame, without distortion, with the edges that cut them.
     ///
-    /// Returns the angle in radians by which the camera looks higher than its mount says, at most twice a second. None if the
-    /// stated errors explain it, or objects at several distances do not agree.
+    /// Returns the angle in radians by which the camera points higher than its mount states, at
+    /// most twice a second. Returns `None` if the stated errors explain the angle, or if objects at
+    /// several distances do not agree.
     pub fn take<'a>(
         &mut self,
         boxes: impl IntoIterator<Item = (&'a Detection, Cut)>,
@@ -105,9 +107,10 @@ impl MountCheck {
 }
 
 impl Projection {
-    /// The angle between the foot of a box and where its height makes one expect it. None where they cannot be compared: the
-    /// image cuts the box, it is of a target, or the ground plays no part. Nor without the camera's height and an object that
-    /// stands.
+    /// The angle between the foot of a box and the direction expected from its height. Returns
+    /// `None` if they cannot be compared: the image cuts the box, the box shows a target, the
+    /// ranging does not use the ground, the camera's height is not configured, or the object does
+    /// not stand.
     fn foot_offset(
         &self,
         detection: &Detection,

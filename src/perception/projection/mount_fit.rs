@@ -1,10 +1,11 @@
 //! The mount of a camera from boxes of people who walk on level ground.
 //!
-//! Where a box stands in the image says how high it is there: horizon and height of the camera follow (Hoiem, Efros,
-//! Hebert, *Putting Objects in Perspective*, IJCV 2008; Lv, Zhao, Nevatia, *Camera Calibration from Video of a Walking
-//! Human*, IEEE T-PAMI 2006). Each person has a height of their own, which is estimated too. Errors of a box follow
-//! Student's t distribution, so that a box that does not show the whole person counts little (Lange, Little, Taylor,
-//! JASA 1989).
+//! The position of a box in the image determines its expected height, which gives the horizon and
+//! the height of the camera (Hoiem, Efros, Hebert, *Putting Objects in Perspective*, IJCV 2008; Lv,
+//! Zhao, Nevatia, *Camera Calibration from Video of a Walking Human*, IEEE T-PAMI 2006). Each
+//! person has a height of their own, which is estimated too. Errors of a box follow Student's t
+//! distribution, so that a box that does not show the whole person counts little (Lange, Little,
+//! Taylor, JASA 1989).
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -49,7 +50,8 @@ pub enum MountFitError {
 
 /// Minimum number of boxes.
 pub const MIN_BOXES: usize = 40;
-/// Least ratio of large boxes to small ones, of which a tenth each are beyond. Errors of the edges alone make small ones.
+/// Least ratio of large boxes to small ones, of which a tenth each are beyond. Errors of the edges
+/// alone make small ones.
 const MIN_HEIGHT_RATIO: f64 = 1.15;
 /// Boxes beyond are thinned out evenly.
 const MAX_BOXES: usize = 3000;
@@ -59,26 +61,30 @@ const MIN_OVERLAP: f64 = 0.2;
 const FREEDOM: f64 = 4.0;
 /// Standard deviation of the height of one person who walks, relative to the mean.
 const GAIT_SIGMA: f64 = 0.02;
-/// Standard deviation of the nearest foot from the edge of a person's footprint, relative to the height.
+/// Standard deviation of the nearest foot from the edge of a person's footprint, relative to the
+/// height.
 const STEP_SIGMA: f64 = 0.06;
-/// Standard deviation in radians of the roll that is expected beforehand, for boxes that say nothing of it.
+/// Standard deviation in radians of the prior of the roll, for boxes that contain no information
+/// about it.
 const ROLL_PRIOR_RAD: f64 = 0.17;
 /// Pitches and rolls in degrees from which the search starts.
 const PITCHES_DEG: std::ops::RangeInclusive<i32> = -20..=80;
 const ROLLS_DEG: [f64; 3] = [0.0, -12.0, 12.0];
-/// Standard deviations of the tilt in radians and of the height, relative, because people are no boxes and detectors cut
-/// legs off: the errors in the tests.
+/// Standard deviations of the tilt in radians and of the height, relative, because people are no
+/// boxes and detectors cut legs off: the errors in the tests.
 const MODEL_TILT_RAD: f64 = 0.007;
 const MODEL_HEIGHT: f64 = 0.02;
-/// Largest standard deviation in degrees of a pitch that is worth to be told.
+/// Maximum standard deviation in degrees of a pitch that is worth reporting.
 const MAX_PITCH_SIGMA_DEG: f64 = 3.0;
 
-/// The height and tilt of a camera from the people in its frames; the rest is that of `mount`.
+/// Estimates the height and tilt of a camera from the people in its frames; the other fields are
+/// copied from `mount`.
 ///
-/// Boxes are whole, without distortion, and have errors of `pixel_sigma_px`; `size` is that of people.
+/// Boxes are whole, without distortion, and have errors of `pixel_sigma_px`; `size` is the size of
+/// people.
 ///
 /// # Errors
-/// [`MountFitError`] if the boxes are too few or too much alike.
+/// Returns [`MountFitError`] if there are too few boxes or they are too much alike.
 pub fn fit_mount(
     frames: &[Vec<BoundingBox>],
     size: &ObjectSize,
@@ -119,7 +125,7 @@ pub fn fit_mount(
     let (start, grown, _) = fit.improved((fit.start(), vec![1.0; fit.people]), |off| {
         (FREEDOM + 1.0) / (FREEDOM + off * off)
     });
-    // Errors beyond a few medians count no more.
+    // Errors beyond a few medians are not counted.
     let mut off: Vec<f64> = fit
         .errors(&start, &grown)
         .iter()
@@ -158,7 +164,8 @@ struct PersonBox {
     person: usize,
 }
 
-/// All boxes, and the number of people: a box that overlaps one of the frame before most is of the same person.
+/// All boxes, and the number of people. A box belongs to the same person as the box of the previous
+/// frame with which it overlaps most.
 fn linked(frames: &[Vec<BoundingBox>]) -> (Vec<PersonBox>, usize) {
     let (mut all, mut before, mut people) = (Vec::new(), Vec::<PersonBox>::new(), 0);
     for frame in frames {
@@ -210,8 +217,8 @@ struct HeadError {
 }
 
 impl HeadError {
-    /// The error in standard deviations. As the foot says where the head should be, its own error counts as in Deming's
-    /// regression: with what the error of the foot does at these parameters.
+    /// The error in standard deviations. Because the foot determines the expected head, the foot's
+    /// own error is included as in Deming's regression, with its effect at these parameters.
     fn in_sigmas(&self, own_sigma: f64) -> f64 {
         self.error / own_sigma.hypot(self.foot_sigma)
     }
@@ -287,8 +294,8 @@ impl HeightFit {
             + at.y * at.y / (2.0 * ROLL_PRIOR_RAD * ROLL_PRIOR_RAD)
     }
 
-    /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the heights of the people relative
-    /// to the mean.
+    /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the
+    /// heights of the people relative to the mean.
     fn errors(&self, at: &Vector3<f64>, grown: &[f64]) -> Vec<Option<HeadError>> {
         let (projection, height_m, half) = (
             self.projection(at),
@@ -308,7 +315,7 @@ impl HeightFit {
             let head_m = near_m + half.mean_m * foot.depth_factor;
             let by_distance = drop_m / (head_m * head_m);
             let by_height = self.size.height_m / head_m;
-            // In shares of the person's height, so that their errors say nothing of its size.
+            // Relative to the person's height, so that the errors do not depend on the height.
             let step_m = self.size.height_m * grown[person.person] * STEP_SIGMA;
             let foot_m =
                 (foot.errors[Source::FootRow as usize] * near_m / foot.slope).hypot(step_m);
@@ -322,8 +329,8 @@ impl HeightFit {
         self.boxes.iter().map(error).collect()
     }
 
-    /// The likeliest values near `start` with their covariance: iteratively reweighted least squares, from which the heights of
-    /// the people are eliminated (Schur complement).
+    /// The likeliest values near `start` with their covariance: iteratively reweighted least
+    /// squares, from which the heights of the people are eliminated (Schur complement).
     fn improved(
         &self,
         (mut at, mut grown): (Vector3<f64>, Vec<f64>),
@@ -400,7 +407,7 @@ impl HeightFit {
 
 /// Slope below the horizon under which a foot is at no distance.
 const MIN_SLOPE: f64 = 1e-3;
-/// Cost of a box whose foot is above the horizon: more than that of any other.
+/// Cost of a box whose foot is above the horizon: higher than the cost of any other box.
 const NO_FOOT_COST: f64 = 10.0;
 /// Least relative standard deviation of people's heights.
 const MIN_SPREAD: f64 = 1e-3;
@@ -408,7 +415,8 @@ const MIN_SPREAD: f64 = 1e-3;
 const NORMAL_MEDIAN: f64 = 1.4826;
 /// Least scale of the errors.
 const MIN_SCALE: f64 = 0.2;
-/// Tuning of Welsch's weights, which makes them 95 % as good as least squares for normal errors (Holland, Welsch 1977).
+/// Tuning of Welsch's weights, which makes them 95 % as good as least squares for normal errors
+/// (Holland, Welsch 1977).
 const WELSCH: f64 = 2.985;
 const MAX_STEPS: usize = 60;
 const MAX_STEP: f64 = 0.1;

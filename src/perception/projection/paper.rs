@@ -1,11 +1,12 @@
 //! Ranging by the paper's formulas (PACE client, Algorithm 1, lines 8-14) to the letter.
 //!
-//! α = γ·w, d = s / tan α, θ = θ_v − γ·x_center, position = (x_v + d cos θ, y_v + d sin θ), with γ the field of view over
-//! the image width, w and x_center the width and middle column of the box, and s the object's width.
+//! α = γ·w, d = s / tan α, θ = θ_v − γ·x_center, position = (x_v + d cos θ, y_v + d sin θ), with γ
+//! the field of view over the image width, w and x_center the width and middle column of the box,
+//! and s the object's width.
 //!
 //! Three things differ from the geometry of a camera:
-//! - x_center counts from the left edge of the image, so θ_v is the direction of that edge. With the heading of the axis
-//!   every object turns by half a field of view clockwise.
+//! - x_center counts from the left edge of the image, so θ_v is the direction of that edge. With
+//!   the heading of the axis every object turns by half a field of view clockwise.
 //! - The angle is spread evenly over the columns; a flat sensor spreads its tangent evenly.
 //! - tan α takes the far leg of a right triangle, 2 tan(α/2) the base of an isosceles one.
 

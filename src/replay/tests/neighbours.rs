@@ -42,7 +42,7 @@ fn neighbours(ms: u64) -> Arc<[NeighbourObject]> {
         .into()
 }
 
-/// A cell says of the only vehicle that it was mostly wrong.
+/// A cell reports that the only vehicle was mostly wrong.
 fn slander() -> Command {
     let mut reputations = ForeignReputations::default();
     let counts = CellCounts {

@@ -1,4 +1,5 @@
-//! Batch estimation: all stored votes are judged together, whatever their order of arrival.
+//! Batch estimation: all stored votes are evaluated together, independent of their order of
+//! arrival.
 
 use super::{START_SWEEPS, WeightedVoting};
 use crate::vote::calibration::ConfidenceCalibration;
@@ -8,10 +9,11 @@ use crate::vote::dependence::Dependence;
 const MAX_LOSS: f64 = 0.01;
 
 impl WeightedVoting {
-    /// Judges all stored votes as online but in the order of the landmarks' names, then `passes` times together (Dawid &
-    /// Skene 1979).
+    /// Evaluates all stored votes as online but in the order of the landmarks' names, then `passes`
+    /// times together (Dawid & Skene 1979).
     ///
-    /// Judging in turn is the better start: each landmark is judged without its own votes in the evidence.
+    /// Evaluation in turn is the better start, because each landmark is evaluated without its own
+    /// votes in the evidence.
     pub(super) fn judge_all(&mut self, passes: u32) {
         let mut dependence = Dependence::of_stored();
         let mut calibration = ConfidenceCalibration::new(self.config.calibration_votes);
@@ -50,7 +52,7 @@ impl WeightedVoting {
             .sum();
         if before - after > MAX_LOSS * votes as f64 {
             (self.model, self.calibration, self.landmarks) = in_turn;
-            // By their order in time, labels that lead by little stay.
+            // In the order of time, labels with a small lead would persist.
             for landmark_votes in self.landmarks.values_mut() {
                 landmark_votes.published = None;
                 landmark_votes.publish(0.0);
@@ -61,7 +63,8 @@ impl WeightedVoting {
         self.calibration.take_live(calibration);
     }
 
-    /// Log of the probability of all votes, each predicted from the other votes on the landmark and those on others.
+    /// Log of the probability of all votes, each predicted from the other votes on the landmark and
+    /// those on others.
     fn log_probability(&mut self) -> f64 {
         let mut sum = 0.0;
         for landmark_votes in self
@@ -81,7 +84,7 @@ impl WeightedVoting {
         sum
     }
 
-    /// One pass: judges every landmark by the same evidence, then replaces the live evidence.
+    /// One pass: evaluates every landmark by the same evidence, then replaces the live evidence.
     fn judge_together(&mut self) {
         self.model.refresh(0..self.names.len());
         let weights = self.calibration.weights();
@@ -108,7 +111,8 @@ impl WeightedVoting {
         }
     }
 
-    /// Forgets all live evidence and every verdict, and judges all landmarks in turn, `sweeps` times.
+    /// Clears all live evidence and every verdict, and evaluates all landmarks in turn, `sweeps`
+    /// times.
     pub(super) fn start_again(&mut self, sweeps: u32) {
         self.model.clear_live();
         self.model.clear_coupling();
@@ -128,7 +132,7 @@ impl WeightedVoting {
         }
     }
 
-    /// Replaces all live evidence by that of the weighted majorities.
+    /// Replaces all live evidence by the evidence from the weighted majorities.
     pub(super) fn start_from_majorities(&mut self) {
         let weights = self.calibration.weights();
         self.model.clear_live();

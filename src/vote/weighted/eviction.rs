@@ -10,7 +10,8 @@ use crate::vote::confusion::LabelIndex;
 use crate::vote::dawid_skene::VehicleEvidence;
 
 impl WeightedVoting {
-    /// Forgets vehicles with their votes and the evidence about them; other vehicles take their indices.
+    /// Removes vehicles with their votes and the evidence about them; other vehicles reuse their
+    /// indices.
     pub(super) fn evict_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         let gone: BTreeSet<usize> = nodes
             .iter()
@@ -38,7 +39,7 @@ impl WeightedVoting {
             .collect()
     }
 
-    /// The index of a label; `stated` is the vehicle that stated it and when.
+    /// The index of a label; `stated` is the vehicle that stated it and the time.
     pub(super) fn label(
         &mut self,
         label: &Label,
@@ -51,7 +52,8 @@ impl WeightedVoting {
         index
     }
 
-    /// Forgets labels with the votes for them, if `label` would be one more than `max_labels`; returns how many votes.
+    /// Removes labels with the votes for them, if `label` would exceed `max_labels`; returns the
+    /// number of votes.
     pub(super) fn evict_labels_for(&mut self, label: &Label, max_labels: usize) -> usize {
         if self.labels.has_room_for(label, max_labels) {
             return 0;

@@ -10,12 +10,12 @@ use crate::vote::config::VoteConfig;
 use crate::vote::confusion::{Confusion, LabelIndex};
 
 impl WeightedVoting {
-    /// Takes over the ledger's remembered votes beyond those that were counted here: a standby has counted the latest
-    /// ones itself. They replace those of an earlier ledger.
+    /// Takes over the ledger's kept votes except those that were counted here: a standby has
+    /// counted the latest votes itself. They replace the votes of an earlier ledger.
     ///
-    /// Where room is short, the labels with most evidence are taken, and the vehicles that were right most often, on a
-    /// tie those in the latest lanes. A ledger counts by stated label only: the truth behind a wrong vote is taken to
-    /// be any other label with equal probability.
+    /// If room is short, the labels with most evidence are taken, and the vehicles that were right
+    /// most often (on a tie, those in the latest lanes). A ledger counts by stated label only: the
+    /// truth behind a wrong vote is assumed to be any other label with equal probability.
     pub(super) fn take_over(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
         let own = |node: &NodeName| {
             self.vehicles
@@ -38,7 +38,7 @@ impl WeightedVoting {
         others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
         let known = [heard, others].concat();
         self.take_over_labels(&known, limits.max_labels);
-        // Evidence that is no longer in the ledger does not count any more.
+        // Evidence that has left the ledger stops counting.
         self.model
             .vehicles
             .iter_mut()
@@ -70,7 +70,7 @@ impl WeightedVoting {
     fn take_over_labels(&mut self, known: &[(NodeName, RememberedVotes)], max_labels: usize) {
         let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
-            // A label that is mostly wrong is of use only where there is room.
+            // A label that is mostly wrong is only useful if there is room.
             *votes.entry(label).or_default() += correct + 1e-3 * incorrect;
         }
         let mut labels: Vec<_> = votes.into_iter().collect();

@@ -57,7 +57,7 @@ impl WeightedVoting {
         }
     }
 
-    /// Takes a landmark's votes out of the live evidence until it is judged again.
+    /// Removes a landmark's votes from the live evidence until it is evaluated again.
     pub(super) fn remove_live(&mut self, landmark: &LandmarkId) {
         if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
             && std::mem::take(&mut landmark_votes.counted)
@@ -75,17 +75,19 @@ impl WeightedVoting {
         }
     }
 
-    /// Turns the judged votes on a landmark into settled evidence; they begin to count anew.
+    /// Turns the evaluated votes on a landmark into settled evidence; new votes are counted from
+    /// then on.
     ///
-    /// All are settled at once. If they were settled in turn, the first would be judged by evidence that the others
-    /// still lack.
+    /// All are settled at once. If they were settled in turn, the first would be evaluated by
+    /// evidence that the others still lack.
     pub(super) fn settle_votes(&mut self, landmark: &LandmarkId) {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
             return;
         };
         if landmark_votes.has_several_voters() {
-            // The model judges a vote by the others: a vehicle that decides alone must not prove itself right to it.
+            // The model evaluates a vote by the others: a vehicle that decides alone must not
+            // confirm itself.
             let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
             let settled: Vec<_> = judged
                 .map(|vote| {

@@ -15,11 +15,12 @@ pub(crate) struct Half;
 /// A number with 24 significant bits, such as the direction of a camera.
 pub(crate) struct Single;
 
-/// A covariance `[xx, xy, yy]` with 11 significant bits. Variances are rounded up and the covariance towards zero, so
-/// that no certainty is gained and the matrix stays positive semi-definite.
+/// A covariance `[xx, xy, yy]` with 11 significant bits. Variances are rounded up and the
+/// covariance towards zero, so that the certainty does not increase and the matrix stays positive
+/// semi-definite.
 pub(crate) struct CovarianceForm;
 
-/// Largest number of millimetres that is written as an integer; no position is beyond.
+/// Largest number of millimetres that is written as an integer; all positions are below.
 const MAX_MILLIMETRES: f64 = (1u64 << 53) as f64;
 
 /// Magnitudes of normal half-precision numbers.
@@ -28,7 +29,7 @@ const HALF: std::ops::RangeInclusive<f64> = 6.103_515_625e-5..=65_504.0;
 /// Magnitudes of normal single-precision numbers.
 const SINGLE: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 
-/// Bits of a double's fraction beyond those of a half and of a single.
+/// Bits of a double's fraction in excess of the bits of a half and of a single.
 const BEYOND_HALF: u64 = (1 << 42) - 1;
 const BEYOND_SINGLE: u64 = (1 << 29) - 1;
 

@@ -261,8 +261,8 @@ fn report_without_rounding() -> ObjectReport {
     }
 }
 
-/// As other programs write: floats of any width where an integer would do, arrays without a count, and more places than
-/// are known here.
+/// Encodings by other programs: floats of any width in place of integers, arrays of indefinite
+/// length, and more indices than this version has.
 #[test]
 fn what_others_write_is_read() {
     let mut bytes = Vec::new();

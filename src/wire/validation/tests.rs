@@ -152,8 +152,8 @@ fn status() -> NodeStatus {
     }
 }
 
-/// Spoils an entry of a sound payload in every listed way and sends it: that entry alone is left out, and its contributor
-/// named.
+/// Spoils an entry of a sound payload in every listed way and sends it: that entry alone is left
+/// out, and its contributor named.
 fn each_flawed_entry_is_left_out<T: Payload + PartialEq + std::fmt::Debug>(
     sound: impl Fn() -> T,
     without: impl Fn(&T) -> usize,
@@ -570,7 +570,7 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
     assert_eq!(message.map, cell_map().map);
 }
 
-/// The compact encoding rounds numbers: none that is valid becomes one that is not.
+/// The compact encoding rounds numbers: a valid number must not become invalid.
 #[test]
 fn the_largest_valid_numbers_are_valid_after_the_rounding_of_every_encoding() {
     let object = FusedObject {

@@ -15,11 +15,12 @@ use crate::messages::newest::ReceivedMap;
 /// Time after a failure until the file is opened again.
 const RETRY_PAUSE: Duration = Duration::from_secs(10);
 
-/// Size from which a log is renamed to `….1`, in place of the one before, and a new one begun: a disk is filled by two of them
-/// at most.
+/// Size from which a log is renamed to `….1`, replacing the previous one, and a new log is started.
+/// The disk therefore holds two of them at most.
 const MAX_BYTES: u64 = 512 * 1024 * 1024;
 
-/// A file of maps with their times of receipt, one JSON object a line. A disk that refuses it costs its lines only.
+/// A file of maps with their times of receipt, one JSON object per line. If the disk fails, only
+/// the log's lines are lost.
 pub(super) struct MapLog {
     path: PathBuf,
     cell: NodeName,
@@ -45,7 +46,7 @@ impl MapLog {
         }
     }
 
-    /// Appends a map. A failure is logged, and ends attempts for [`RETRY_PAUSE`].
+    /// Appends a map. A failure is logged, and suspends attempts for [`RETRY_PAUSE`].
     pub(super) fn append(&mut self, map: &ReceivedMap) {
         let is_present = *self.present_cell.borrow() == self.cell;
         if !is_present || self.file.is_none() && map.received_at < self.retry_at {
@@ -111,7 +112,7 @@ fn ends_within_a_line(file: &mut File) -> io::Result<bool> {
     Ok(last != *b"\n")
 }
 
-/// A line of the log; readers take it for a [`ReceivedMap`].
+/// A line of the log, in the format of [`ReceivedMap`].
 #[derive(Serialize)]
 struct LogLine<'a> {
     cell: &'a NodeName,

@@ -1,4 +1,5 @@
-//! Queue of reports before the fuser: the latest of each vehicle and kind, and of each vehicle a bounded number of objects.
+//! Queue of reports before the fuser: the latest of each vehicle and kind, and of each vehicle a
+//! bounded number of objects.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,15 +12,16 @@ use ecod::wire::{ObjectReport, ReportKind};
 use crate::platform::throttle::KeyedThrottle;
 use crate::transport::mqtt::Delivery;
 
-/// Maximum number of objects a second of one vehicle, its parts together: reports of 1000 objects at 15 Hz. More would take the
-/// processor time of the others.
+/// Maximum number of objects per second of one vehicle including its parts: reports of 1000 objects
+/// at 15 Hz. More would take the processor time of other vehicles.
 const MAX_OBJECTS_HZ: u32 = 15_000;
 
-/// Maximum number of them at once: more would delay the round.
+/// Maximum number of objects at once: more would delay the round.
 const OBJECT_BURST: u32 = 3_000;
 
-/// Queue filled on the links' tasks and emptied by the fuser. It holds at most one report of each vehicle and kind, so
-/// that a flood from one vehicle delays no other, and takes at most `MAX_OBJECTS_HZ` objects a second of each.
+/// Queue filled by the links' tasks and emptied by the fuser. It holds at most one report of each
+/// vehicle and kind, so that a flood from one vehicle does not delay other vehicles, and accepts at
+/// most `MAX_OBJECTS_HZ` objects per second of each vehicle.
 #[derive(Debug, Clone, Default)]
 pub struct LatestReportQueue(Arc<Mutex<Waiting>>);
 
@@ -45,7 +47,7 @@ impl Default for Waiting {
     }
 }
 
-/// A report and the algorithm that it is for.
+/// A report and its algorithm.
 #[derive(Debug)]
 pub struct QueuedReport {
     /// The algorithm.
@@ -57,11 +59,11 @@ pub struct QueuedReport {
 /// Outcome of adding a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PushOutcome {
-    /// The queue was empty: the fuser has to be told.
+    /// The queue was empty: the caller must notify the fuser.
     pub is_first: bool,
-    /// An older report of the vehicle was dropped for this one, or this one for a newer.
+    /// An older report of the vehicle was dropped for this report, or this report for a newer one.
     pub has_replaced: bool,
-    /// The report was dropped: its vehicle has sent too many objects lately.
+    /// The report was dropped because its vehicle has recently sent too many objects.
     pub is_over_budget: bool,
 }
 

@@ -1,4 +1,4 @@
-//! What a new leader goes on from.
+//! The state from which a new leader continues.
 
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::{Leadership, Position};
@@ -82,7 +82,8 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
                 .cast(map(&epoch(u64::MAX, "gauss"), round, Timestamp(round)))
                 .unwrap();
         }
-        // The filter believes who goes on publishing; a new leader does not go on from that.
+        // The filter accepts a publisher that keeps publishing; a new leader does not continue from
+        // such a map.
         follower
             .cast(map(&epoch(u64::MAX, "gauss"), 4, Timestamp(600_000)))
             .unwrap();
@@ -138,7 +139,8 @@ fn take(
     fuser.take(&Delivery::local(message, received_at));
 }
 
-/// A clock that is off is named with its error while the reports are refused, and afterwards, when they are put right.
+/// A wrong clock is reported with its error, both while the reports are refused and later, when
+/// they are corrected.
 #[test]
 fn a_clock_that_is_off_is_named() {
     let mut fuser = standby();
@@ -187,7 +189,8 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
     );
 }
 
-/// Where objects are tracked, they may be anywhere near the locations: three metres, but not three hundred.
+/// Where objects are tracked, they may be anywhere near the locations: three metres, but not three
+/// hundred.
 #[test]
 fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
     let mut fuser = standby();
@@ -210,7 +213,7 @@ fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
     assert_eq!(told, [("watson".to_owned(), "misplaced".to_owned())]);
 }
 
-/// Two programs of one name are told; one that starts again is not.
+/// Two programs with one name are reported; a program that restarts is not.
 #[test]
 fn two_programs_that_report_under_one_name_are_told() {
     for (senders, is_told) in [(1, false), (2, true)] {
@@ -238,7 +241,8 @@ fn two_programs_that_report_under_one_name_are_told() {
     }
 }
 
-/// A vehicle in centimetres has its objects at no location, or far from its camera, whoever else is right.
+/// A vehicle that reports in centimetres has no object at a landmark, or objects far from its
+/// camera; it is reported independent of other vehicles.
 #[test]
 fn a_vehicle_whose_objects_are_nowhere_is_named() {
     let mut fuser = standby();
@@ -283,7 +287,8 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
     );
 }
 
-/// One that states the same and stands, as well as an estimate of its pose does, is not told.
+/// A vehicle that states that it does not move, and stands within the error of its pose, is not
+/// reported.
 #[test]
 fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
     let mut fuser = standby();
@@ -339,7 +344,7 @@ fn locations_that_only_one_side_knows_are_named() {
     )];
     assert_eq!(troubles(&with), unknown);
 
-    // Votes for a location that no list has are ignored: that is told too.
+    // Votes for a location that is not configured are ignored, and this is reported too.
     let mut votes = standby();
     votes.aggregator =
         Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));

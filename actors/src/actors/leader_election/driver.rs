@@ -1,4 +1,5 @@
-//! From messages to the inputs of the node's leadership, and from its effects to the node's parts.
+//! Converts messages to inputs of the node's leadership, and carries out its effects on the node's
+//! parts.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
@@ -33,7 +34,7 @@ use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
 
-/// The node's leadership, and where its effects go.
+/// The node's leadership and the destinations of its effects.
 pub struct ElectionDriver {
     machine: LeadershipNode,
     cell_time: CellTime,
@@ -49,7 +50,7 @@ pub struct ElectionDriver {
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
-    /// The last word of a leader about this node: the leader and its words.
+    /// The leader's last complaint about this node: the leader and the trouble.
     complaint: Option<(NodeName, Trouble)>,
     /// Nodes at whose brokers this one has no login.
     no_login: Vec<NodeName>,
@@ -163,13 +164,13 @@ impl ElectionDriver {
             MembershipEvent::Troubled { about, kind, cause } => {
                 return self.counters.troubles().note_about(&about, kind, &cause);
             }
-            // The node ends with this as its error.
+            // The node ends with this error.
             MembershipEvent::Excluded => return,
         };
         self.handle(input).await;
     }
 
-    /// Notes what a node says of itself, and what a leader says of this node.
+    /// Processes another node's status: its own state, and the leader's complaints about this node.
     pub(super) async fn take_status(&mut self, status: &NodeStatus) {
         if self.leadership.borrow().leader() == Some(&status.node) && status.node != self.name {
             let of_this = |trouble: &&Trouble| {
@@ -190,7 +191,7 @@ impl ElectionDriver {
         .await;
     }
 
-    /// Hands in what happened, and carries out what comes of it before anything else happens.
+    /// Passes an input to the leadership, and carries out its effects before the next input.
     pub(super) async fn handle(&mut self, input: Input) {
         if input == Input::Wake {
             self.alarm = Timestamp(u64::MAX);
@@ -212,13 +213,13 @@ impl ElectionDriver {
         self.set_timer();
     }
 
-    /// Gives up the lead, and waits until the disk has the last term.
+    /// Resigns, and waits until the last term is on disk.
     pub(super) async fn leave(&mut self) {
         self.handle(Input::Leave).await;
         self.terms.wait_for(u64::MAX).await;
     }
 
-    /// Does what the leadership wants; returns what it is to be told at once.
+    /// Carries out an effect of the leadership; returns inputs that must be passed back at once.
     async fn carry_out(&mut self, effect: Effect) -> Vec<Input> {
         match effect {
             Effect::PersistTerm { term } => self.terms.save(term),
@@ -331,7 +332,8 @@ impl ElectionDriver {
         Vec::new()
     }
 
-    /// Notes clocks that are off, the leader's complaint, and that the cell's description is not used.
+    /// Records troubles: wrong clocks, the leader's complaint, and an unused description of the
+    /// cell.
     fn note_troubles(&self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
         for clock in self.cell_time.wrong_clocks(clock::now()) {
@@ -363,7 +365,7 @@ impl ElectionDriver {
         }
     }
 
-    /// Shows the leadership; a change of the highest known term alone wakes nobody.
+    /// Publishes the leadership; a change of only the highest term does not notify readers.
     fn tell(&self, leadership: Leadership) {
         let Leadership {
             position,
@@ -402,7 +404,7 @@ impl ElectionDriver {
     }
 }
 
-/// A member as the node's leadership wants to know it.
+/// Converts a member to the form that the node's leadership needs.
 fn as_seen(member: &Member) -> node::SeenMember {
     node::SeenMember {
         name: member.name.clone(),
@@ -412,7 +414,7 @@ fn as_seen(member: &Member) -> node::SeenMember {
     }
 }
 
-/// The error of a clock in words.
+/// The error of a clock as text.
 fn clock_words(clock: &WrongClock<'_>) -> String {
     let seconds = clock.error_us.unsigned_abs() as f64 / 1e6;
     let side = if clock.error_us > 0 {
@@ -428,7 +430,7 @@ fn clock_words(clock: &WrongClock<'_>) -> String {
     format!("its clock is {seconds:.1} s {side} {others}")
 }
 
-/// The remedy where it is clear which clock is wrong, or else both.
+/// The remedy for the wrong clock or, if it is unclear which clock is wrong, for both.
 fn clock_remedy(clock: &WrongClock<'_>) -> &'static str {
     if clock.is_certain {
         TroubleKind::ClockOff.remedy()
@@ -494,7 +496,7 @@ fn log(notice: Notice) {
             "followers cannot log in at this node's broker: check its certificate, `listen` and the firewall; if they \
              are more than half, the lead goes to another candidate"
         ),
-        // Told where they are carried out.
+        // Reported where these effects are carried out.
         Notice::Overreached { .. } | Notice::NoLogin { .. } => {}
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");

@@ -1,7 +1,8 @@
-//! Signatures under the signs of life of leaders, in a cell with certificates.
+//! Signatures on leaders' signs of life, in a cell with certificates.
 //!
-//! A leader signs how long it has led. Another node passes that on to one which misses the leader. The latter believes no
-//! member, only the leader's signature: so no member keeps a cell waiting for a leader that hangs.
+//! A leader signs how long it has led. Another node passes the signed time on to a node that misses
+//! the leader. The receiver relies only on the leader's signature, so a faulty member cannot make a
+//! cell wait for a leader that hangs.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -17,18 +18,19 @@ use crate::transport::pki::{Credentials, is_signed_by};
 /// Maximum number of nodes whose certificates are kept.
 const MAX_CERTIFICATES: usize = 4096;
 
-/// Signs the own signs of life, and checks those of others.
+/// Signs this node's signs of life, and verifies other leaders' signs of life.
 pub(super) struct LifeSigns {
     cell: NodeName,
     credentials: Option<Arc<Credentials>>,
-    /// Certificates by which other nodes have proven who they are.
+    /// Certificates with which other nodes have proven their identity.
     certificates: BTreeMap<NodeName, Arc<[u8]>>,
     /// The last sign of life that was signed, and its leadership.
     signed: Option<(Epoch, LifeSign)>,
 }
 
 impl LifeSigns {
-    /// Without `credentials`, in a cell without certificates, nothing is signed, and all is believed.
+    /// Without `credentials`, in a cell without certificates, signs of life are unsigned and all
+    /// are accepted.
     pub(super) fn new(cell: NodeName, credentials: Option<Arc<Credentials>>) -> Self {
         Self {
             cell,
@@ -38,7 +40,7 @@ impl LifeSigns {
         }
     }
 
-    /// Keeps the certificate of a node that has proven it.
+    /// Stores the certificate of a node that has proven it.
     pub(super) fn meet(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
         let Some(certificate) = certificate else {
             return;
@@ -49,7 +51,7 @@ impl LifeSigns {
         }
     }
 
-    /// Forgets the certificate of a node that was expelled.
+    /// Removes the certificate of a node that was expelled.
     pub(super) fn forget(&mut self, name: &NodeName) {
         self.certificates.remove(name);
     }
@@ -68,7 +70,8 @@ impl LifeSigns {
             *life = signed.clone();
             return;
         }
-        // Without random numbers the system gives no signature, and others do not pass this on.
+        // If the system provides no random numbers, there is no signature, and other nodes do not
+        // pass this sign of life on.
         life.signature = credentials
             .current()
             .sign(&life.signed_bytes(&self.cell, epoch))

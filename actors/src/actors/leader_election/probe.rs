@@ -1,4 +1,4 @@
-//! Questions to a node's parts, asked without waiting.
+//! Non-blocking queries of a node's parts.
 
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::node::Input;
@@ -12,7 +12,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::transport::broker::BrokerHealth;
 
-/// Asks broker, gateway and fuser, and tells the election when they have answered.
+/// Queries broker, gateway and fuser, and sends their answers to the election.
 pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
     let (broker, gateway, fuser) = (
         parts.broker.clone(),
@@ -49,7 +49,8 @@ pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>
     });
 }
 
-/// The load of the last minute on all processors, 0 to 100 %; nothing where the system does not tell.
+/// The load of the last minute on all processors, 0 to 100 %; `None` if the system does not provide
+/// it.
 pub(super) fn load_percent() -> Option<u8> {
     let text = std::fs::read_to_string("/proc/loadavg").ok()?;
     let load: f64 = text.split_whitespace().next()?.parse().ok()?;

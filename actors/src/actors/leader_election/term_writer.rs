@@ -5,10 +5,12 @@ use tokio::sync::watch;
 
 use crate::platform::state_file::StateFile;
 
-/// Writer of terms that does not hold up its caller: a leader whose disk takes long must go on beating.
+/// Writer of terms that does not block its caller: a leader with a slow disk must continue to send
+/// beats.
 ///
-/// The election hands terms in before they are needed. Only a node that is about to lead in a term waits for the disk's
-/// answer, [`DISK_TIMEOUT`] at most. A disk that fails or hangs stops no leader.
+/// The election hands terms to the writer before they are needed. Only a node that is about to lead
+/// in a term waits for the disk's answer, for [`DISK_TIMEOUT`] at most. A disk that fails or hangs
+/// does not stop a leader.
 #[derive(Debug)]
 pub(super) struct TermWriter {
     wanted: watch::Sender<u64>,
@@ -38,8 +40,8 @@ pub(super) enum TermState {
     NoDisk,
 }
 
-/// Maximum term that is believed of a disk: no cell counts so far in a thousand years. Earlier versions wrote terms that
-/// were forged, and that left no room for elections.
+/// Maximum term that is accepted from a disk; a cell would need more than a thousand years to reach
+/// it. Earlier versions wrote forged terms, which left no room for elections.
 const MAX_SAVED_TERM: u64 = 1 << 40;
 
 /// The term that the last run of the node saved; 0 without any.
@@ -55,7 +57,8 @@ pub fn saved_term(file: Option<&StateFile>) -> u64 {
 }
 
 impl TermWriter {
-    /// A writer that ends, with what it was handed last on disk, after it is dropped; without a file it does nothing.
+    /// Creates a writer. After it is dropped, it ends once the last term is on disk. Without a file
+    /// it does nothing.
     pub(super) fn new(file: Option<StateFile>) -> Self {
         let (wanted, terms) = watch::channel(0);
         let (answers, answer) = watch::channel(DiskAnswer::default());
@@ -71,15 +74,15 @@ impl TermWriter {
         }
     }
 
-    /// Has a term written some time soon.
+    /// Schedules the writing of a term.
     pub(super) fn save(&self, term: u64) {
         self.wanted.send_replace(term);
     }
 
-    /// Waits for the disk's answer to `term`, or to the last term handed in if that is lower. A disk that was found to hang
-    /// is not waited for again until it answers something.
+    /// Waits for the disk's answer to `term`, or to the last scheduled term if that is lower. A
+    /// disk that was found to hang is not waited for again until it gives an answer.
     pub(super) async fn wait_for(&mut self, term: u64) -> TermState {
-        // A node may unlearn a term, and then hands in a lower one: earlier answers are not about it.
+        // A node may drop a term and then schedule a lower one; earlier answers do not apply to it.
         let wanted = *self.wanted.borrow();
         let term = term.min(wanted);
         let is_about = |answer: &DiskAnswer| (term..=wanted).contains(&answer.term);

@@ -1,4 +1,4 @@
-//! The rhythm of the keeper.
+//! The periods of the keeper.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReputationKeeperConfig {
-    /// Seconds between publications; what changed is saved before. Default 1. More spares a flash disk, and loses so
-    /// much more of the latest evidence when a node crashes.
+    /// Seconds between publications; changes are saved before each. Default 1. A higher value
+    /// reduces writes to a flash disk, and loses correspondingly more evidence when a node crashes.
     pub publish_period_s: f64,
-    /// Seconds between shares of all evidence with the other candidates, beside what changed after each round.
-    /// Default 10. Less repairs lost shares sooner.
+    /// Seconds between shares of all evidence with the other candidates, in addition to changes
+    /// shared after each round. Default 10. A lower value repairs lost shares sooner.
     pub snapshot_period_s: f64,
 }
 
@@ -30,7 +30,7 @@ impl ReputationKeeperConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("publish_period_s", self.publish_period_s, 0.05, 3600.0)?;
         check_range(

@@ -1,4 +1,4 @@
-//! The keeper's part in the exchange with other cells: counts for the uplink, votes from it.
+//! The keeper's exchange with other cells: counts for the uplink, votes from the uplink.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -10,29 +10,29 @@ use ecod::wire::ForeignVotes;
 use super::ReputationKeeperState;
 use crate::messages::uplink::UplinkMessage;
 
-/// Maximum number of vehicles whose counts a new leader compares with those in the region. A leader before it may not have
-/// come to tell them.
+/// Maximum number of vehicles whose counts a new leader compares with the region's. A former leader
+/// may have stopped before it sent them.
 const MAX_COMPARED: usize = 256;
 
-/// Counts that the uplink knows.
+/// Counts that were sent to the uplink.
 #[derive(Debug, Default)]
 pub(super) struct ToldCounts {
     counts: BTreeMap<NodeName, CellCounts>,
-    /// True if the ledger may have others.
+    /// True if the ledger may contain different counts.
     pub(super) is_due: bool,
-    /// True if the uplink that knew them is gone.
+    /// True if the uplink that had them has ended.
     is_lost: bool,
 }
 
 impl ReputationKeeperState {
-    /// Publishes from now on beside these votes of other cells.
+    /// From now on publishes reputations that include these votes of other cells.
     pub(super) fn set_foreign(&mut self, round: u64, votes: BTreeMap<NodeName, ForeignVotes>) {
         self.arguments.reputations.open().foreign = votes;
         self.last_round = self.last_round.max(round);
     }
 
-    /// Tells the uplink the counts of the vehicles that were counted last, also if it knows them. One that starts is reached by
-    /// the next look at the latest.
+    /// Sends the uplink the counts of the most recently counted vehicles, even if it has them
+    /// already. A vehicle that is counted later is included at the next check at the latest.
     pub(super) fn tell_all(&mut self) {
         if self.resync.leads().is_none() {
             return;
@@ -61,7 +61,7 @@ impl ReputationKeeperState {
         };
     }
 
-    /// Tells the uplink what has changed, while this node leads.
+    /// Sends changed counts to the uplink, while this node leads.
     pub(super) fn tell_uplink(&mut self) {
         let is_wanted = self.resync.leads().is_some() && self.arguments.uplink.get().is_some();
         if is_wanted && self.told.is_lost {
@@ -74,7 +74,7 @@ impl ReputationKeeperState {
         let now = store
             .ledger
             .cell_counts(self.arguments.reputation.memory_votes);
-        // Of vehicles that it knew before a reset, nothing counts any more.
+        // After a reset, all counts of vehicles that the uplink had are void.
         let nothing = CellCounts {
             reset_at: store.ledger.reset_at(),
             ..CellCounts::default()

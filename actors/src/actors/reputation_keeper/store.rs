@@ -21,14 +21,15 @@ use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::transport::pki::EvidenceSigner;
 
-/// Evidence about vehicles; it outlives the runs of the actor that keeps it.
+/// Evidence about vehicles; it outlives individual runs of the actor that keeps it.
 #[derive(Debug)]
 pub struct ReputationStore {
     /// The evidence.
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
     pub standing: BTreeMap<NodeName, Reputation>,
-    /// Votes of other cells, as they count here. They are not saved: the region keeps them.
+    /// Votes of other cells with their weight here. They are not saved, because the region keeps
+    /// them.
     pub(super) foreign: BTreeMap<NodeName, ForeignVotes>,
     pub(super) by_evidence: bool,
     restored: bool,
@@ -43,8 +44,9 @@ impl ReputationStore {
         }
     }
 
-    /// Takes over what was saved, within the bounds of what others send. Where evidence is signed, `signer` verifies it.
-    /// `date` is the present time; a clock that was never set judges no other.
+    /// Loads saved evidence, within the bounds for other nodes' evidence. If evidence is signed,
+    /// `signer` verifies it. `date` is the current time; a clock that was never set is not used for
+    /// checks.
     fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
         let Saved {
             entries,
@@ -158,12 +160,12 @@ pub(super) struct Saved {
     schema: u32,
     cell: NodeName,
     node: NodeName,
-    /// All counts; where evidence is signed, only those that this node counted itself.
+    /// All counts; if evidence is signed, only this node's own counts.
     entries: Vec<LedgerEntry>,
     #[serde(default)]
     marks: Vec<LedgerMark>,
     standing: BTreeMap<NodeName, Reputation>,
-    /// True if the counts of others are in `statements`.
+    /// True if the counts of other nodes are in `statements`.
     #[serde(default)]
     signed: bool,
     /// The certificate under which this node counted, in base64.
@@ -209,7 +211,7 @@ impl Saved {
         }
     }
 
-    /// No evidence, and none from before a time.
+    /// An empty state that also voids evidence from before `reset_at_us`.
     fn reset(cell: &NodeName, node: &NodeName, reset_at_us: Timestamp) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -230,10 +232,11 @@ impl Saved {
     }
 }
 
-/// Empties the file, so that a node which starts with it tells others to forget evidence from before `reset_at`.
+/// Empties the file. A node that starts with it makes the other nodes drop evidence from before
+/// `reset_at`.
 ///
 /// # Errors
-/// When the disk refuses it.
+/// Returns the error of the disk.
 pub fn reset_saved(
     file: &StateFile,
     cell: &NodeName,

@@ -1,4 +1,4 @@
-//! Evidence of others: what it costs, and where it goes.
+//! Evidence of other nodes: its cost, and where it is used.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -366,7 +366,8 @@ async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch
         credentials,
         ..arguments(&gateway, &counters)
     });
-    // `turing` signs counts of a leadership that never was, and lets anybody say anything at its own broker.
+    // `turing` signs counts of an invented leadership, and its own broker lets every client publish
+    // any message.
     let invented = share("gauss", None, vec![counted(6, "turing")]);
     let over = |broker: &str, mut share: Delivery<Arc<LedgerShare>>| {
         share.broker = Some(name(broker));
@@ -649,7 +650,8 @@ async fn counts_leap_no_further_after_a_restart_than_before() {
     );
 }
 
-/// A standby that takes over waits for the leader's evidence, and for nothing that others say in its name.
+/// A standby that takes over waits for the leader's evidence, and ignores messages of other nodes
+/// in the leader's name.
 #[tokio::test]
 async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
     let (gateway, _published) = listening::slot().await;
@@ -689,7 +691,8 @@ async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
     );
 }
 
-/// The uplink is told all when this node leads, then what changes, and after a reset that nothing counts any more.
+/// The uplink gets all counts when this node starts to lead, then the changes, and after a reset
+/// zero counts.
 #[tokio::test]
 async fn the_uplink_is_told_what_other_cells_are_to_know() {
     let ((gateway, _published), (uplink, mut told)) =

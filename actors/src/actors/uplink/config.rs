@@ -14,17 +14,20 @@ use crate::transport::mqtt::MqttConfig;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct UplinkConfig {
-    /// The region's broker as `host:port`; default none: the cell tells nobody beyond itself.
+    /// The region's broker as `host:port`. Default: not set; the cell then has no connection to
+    /// other cells.
     pub broker: Option<BrokerAddress>,
-    /// PEM file with the CAs of the broker's certificate; default none: plaintext. The host in `broker` must be a name in
-    /// the certificate. A node with `[tls]` presents its own certificate.
+    /// PEM file with the CAs of the broker's certificate. Default: not set, plaintext. The host in
+    /// `broker` must be a name in the certificate. A node with `[tls]` presents its own
+    /// certificate.
     pub ca: Option<PathBuf>,
-    /// User name; default none. Needs `password`.
+    /// User name. Default: not set. Needs `password`.
     pub user: Option<String>,
-    /// Password; default none. Never printed.
+    /// Password. Default: not set. It is not printed.
     pub password: Option<Secret>,
-    /// Maps per second to the region; default 2, and five times as many while a neighbouring cell is heard. Trade-off:
-    /// more bytes, and a neighbour sooner knows of what comes.
+    /// Maps per second to the region; default 2, and five times as many while maps of a
+    /// neighbouring cell arrive. Trade-off: a higher rate costs bytes, and neighbours see
+    /// approaching objects sooner.
     pub max_hz: f64,
 }
 
@@ -40,26 +43,27 @@ impl Default for UplinkConfig {
     }
 }
 
-/// Messages that may wait to be sent. More would be old maps.
+/// Maximum number of queued messages. More would be old maps.
 const SEND_QUEUE: usize = 8;
 
-/// Largest map in bytes that is sent and decoded, as the region's servers take it.
+/// Maximum size in bytes of a map that is sent or decoded, as accepted by the region's servers.
 const MAX_MAP_BYTES: usize = 256 * 1024;
 
-/// Milliseconds within which the broker must accept a connection. After an outage the cells of a region all log in at once.
+/// Milliseconds within which the broker must accept a connection. After an outage all cells of a
+/// region log in at once.
 const CONNECT_TIMEOUT_MS: u64 = 10_000;
 
 impl UplinkConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_hz", self.max_hz, 0.1, 4.0)?;
         self.connection(&MqttConfig::default()).validate()
     }
 
-    /// Settings of the connection; the limit of payloads other than maps is that of `cell`.
+    /// Settings of the connection; the limit for payloads other than maps is taken from `cell`.
     pub(crate) fn connection(&self, cell: &MqttConfig) -> MqttConfig {
         MqttConfig {
             broker: self.broker.clone(),

@@ -4,16 +4,18 @@ use std::time::Duration;
 
 use ecod::model::time::Timestamp;
 
-/// Time after a neighbour's last map for which it counts as there.
+/// Time after a neighbour's last map for which the neighbour counts as present.
 const NEIGHBOUR_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Factor of the rate while a neighbour is heard.
+/// Factor on the rate while a neighbour is present.
 const NEIGHBOUR_FACTOR: f64 = 5.0;
 
-/// Share of the interval by which a map may be early. Rounds close a little before or after due times.
+/// Share of the interval by which a map may be early. Rounds close a little before or after due
+/// times.
 const MAX_EARLY_SHARE: f64 = 0.25;
 
-/// The times at which maps are due. They keep their grid whenever maps come, so that the mean rate is the configured one.
+/// The times at which maps are due. They stay on a fixed grid independent of when maps arrive, so
+/// that the mean rate is the configured rate.
 #[derive(Debug)]
 pub(super) struct MapPace {
     max_hz: f64,
@@ -33,7 +35,7 @@ impl MapPace {
         }
     }
 
-    /// Notes that a neighbour's map was accepted.
+    /// Records that a neighbour's map was accepted.
     pub(super) fn note_neighbour(&mut self, now: Timestamp) {
         self.neighbour_at = Some(now);
     }
@@ -43,7 +45,7 @@ impl MapPace {
         now + self.max_early >= self.due
     }
 
-    /// Notes that the map that was due is dealt with.
+    /// Advances to the next due time.
     pub(super) fn advance(&mut self, now: Timestamp) {
         let is_heard = self
             .neighbour_at
@@ -63,7 +65,8 @@ impl MapPace {
 mod tests {
     use super::*;
 
-    /// Number of maps in ten seconds of rounds about every 100 ms, up to 10 ms early or late, from this time on.
+    /// Number of maps in ten seconds of rounds about every 100 ms, up to 10 ms early or late, from
+    /// this time on.
     fn count(pace: &mut MapPace, from_ms: u64) -> usize {
         let rounds = (0..100).map(|round| from_ms + 100 * round + 7 * round % 20 - 10);
         let due = rounds.filter(|ms| {

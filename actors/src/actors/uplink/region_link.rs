@@ -1,4 +1,4 @@
-//! The link to the region's broker, and what is published on it.
+//! The link to the region's broker, and the messages published on it.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -22,7 +22,8 @@ use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink
 use crate::transport::mqtt::packet_sink::PacketSink;
 use crate::transport::mqtt::{MqttConfig, Security};
 
-/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node that stops waits for it.
+/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node
+/// that stops waits for it.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Time until a full queue may have room.
@@ -87,7 +88,8 @@ impl RegionLink {
             payload: offline_payload(status, config.encoding).into(),
         };
         let setup = Arc::new(LinkSetup {
-            // Known to nobody else: who takes over a client id ends its connection. The id of this run is in the status.
+            // Kept secret, because a client that uses the same client id ends this connection. The
+            // id of this run is in the status.
             client_id: format!("{cell}-{}-{}", status.node, Uuid::new_v4().simple()),
             filters,
             will: Mutex::new(will),
@@ -117,7 +119,7 @@ impl RegionLink {
         self.tile
     }
 
-    /// True if it is connected, and the broker passes messages on.
+    /// True if the link is connected and the broker forwards messages.
     pub(super) fn is_up(&self) -> bool {
         self.link.state == LinkState::Up
     }
@@ -130,7 +132,8 @@ impl RegionLink {
             .is_some_and(|client| client.subscribe(filters, MaxQos::AtMostOnce))
     }
 
-    /// Unsubscribes from these filters, as far as there is room: what comes nevertheless is not used.
+    /// Unsubscribes from these filters, as far as the queue has room; messages that still arrive
+    /// are ignored.
     pub(super) fn unsubscribe(&self, filters: &[String]) {
         if let Some(client) = &self.link.client
             && !client.unsubscribe(filters)
@@ -139,7 +142,7 @@ impl RegionLink {
         }
     }
 
-    /// Publishes what the cell says of a vehicle; false when there is no room.
+    /// Publishes this cell's counts about a vehicle; returns false if the queue is full.
     pub(super) fn publish_reputation(&self, message: &CellReputation) -> bool {
         let topic = ReputationTopic {
             vehicle: message.vehicle.clone(),
@@ -150,7 +153,8 @@ impl RegionLink {
             .publish(&topic.path(), &payload, Retention::Retained)
     }
 
-    /// Takes in an event of the link; true when it has just been established and nothing is published yet.
+    /// Processes an event of the link; returns true if the connection has just been established and
+    /// has no published messages yet.
     pub(super) fn change(&mut self, change: LinkChange) -> bool {
         let state = match change {
             LinkChange::Accepted { client, .. } => {
@@ -176,7 +180,8 @@ impl RegionLink {
         state == LinkState::Up && before != LinkState::Stalled
     }
 
-    /// Publishes a map, unless the broker is not there or passes nothing on: maps do not wait. True if it is sent.
+    /// Publishes a map, unless the broker is unreachable or does not forward messages: maps are not
+    /// queued. Returns true if it was sent.
     pub(super) fn publish_map(&mut self, map: &CellMap, now: Timestamp) -> bool {
         let payload = Bytes::from(encode(map, self.setup.config.encoding));
         if payload.len() > self.setup.config.max_map_bytes {
@@ -195,7 +200,7 @@ impl RegionLink {
         } else {
             Event::RegionWithheld
         });
-        // The own map comes back, as that of any cell around.
+        // This cell's own map comes back, like the maps of the cells around.
         if self.link.state == LinkState::Up && self.link.misses_echo(now) {
             self.link.state = LinkState::Stalled;
             tracing::info!(broker = %self.link.broker, state = ?LinkState::Stalled, "uplink changed");
@@ -203,7 +208,8 @@ impl RegionLink {
         is_sent
     }
 
-    /// Publishes the node's status, now if there is a connection, and as the last will of later ones.
+    /// Publishes the node's status, now if there is a connection, and as the last will of later
+    /// ones.
     pub(super) fn publish_status(&mut self, status: &NodeStatus) {
         let encoding = self.setup.config.encoding;
         self.setup
@@ -222,8 +228,8 @@ impl RegionLink {
         );
     }
 
-    /// Ends the connection without last will, after what is to be said of vehicles, and after `last` as the retained status,
-    /// if it is given.
+    /// Ends the connection without the last will, after the remaining counts about vehicles and, if
+    /// given, after `last` as the retained status.
     pub(super) async fn close(
         mut self,
         last: Option<&NodeStatus>,
@@ -240,7 +246,7 @@ impl RegionLink {
         self.link.leave(LEAVE_TIMEOUT).await;
     }
 
-    /// Publishes what the cell says of vehicles, as fast as the broker takes it.
+    /// Publishes this cell's counts about vehicles, as fast as the broker accepts them.
     async fn publish_reputations(&self, messages: &[CellReputation]) {
         for message in messages.iter().filter(|_| self.is_up()) {
             while !self.publish_reputation(message) {
@@ -249,8 +255,8 @@ impl RegionLink {
         }
     }
 
-    /// Ends the connection of a cell that is not in its tile any more. Removes what the tile has of it, if it is
-    /// connected.
+    /// Ends the connection of a cell that has left its tile. If connected, first removes the cell's
+    /// messages from the tile.
     pub(super) async fn withdraw(mut self) {
         self.retain(RegionTopicKind::Status, Bytes::new());
         self.retain(RegionTopicKind::Cell, Bytes::new());

@@ -1,4 +1,4 @@
-//! The exchange of cells about vehicles, as this uplink carries it out.
+//! The exchange of counts about vehicles between cells, as carried out by this uplink.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -18,20 +18,20 @@ use crate::platform::clock;
 use crate::telemetry::counters::Event;
 use crate::transport::mqtt::region_inbox::source;
 
-/// Time between two looks at what is to be told and asked.
+/// Time between two steps of the exchange.
 pub(super) const EXCHANGE_PERIOD: Duration = Duration::from_millis(250);
 
-/// Maximum number of messages about vehicles in that time. Maps share the link's queue.
+/// Maximum number of messages about vehicles per step. Maps share the link's queue.
 const MAX_MESSAGES: usize = 6;
 
 impl UplinkState {
-    /// Takes the vehicles that are present.
+    /// Sets the present vehicles.
     pub(super) fn set_present(&mut self, vehicles: &BTreeSet<NodeName>) {
         self.exchange.set_present(vehicles);
         self.exchange_reputations();
     }
 
-    /// Takes what the cell's own evidence says.
+    /// Sets the counts of the cell's own evidence.
     pub(super) fn count_vehicles(&mut self, counts: Vec<(NodeName, CellCounts)>) {
         let (before, now) = (self.exchange.dropped(), clock::now());
         counts
@@ -43,7 +43,8 @@ impl UplinkState {
         );
     }
 
-    /// Takes what a cell says of a vehicle; what does not count is counted by its reason and cell.
+    /// Processes a cell's counts about a vehicle; counts that are not accepted are counted by
+    /// reason and cell.
     pub(super) fn take_reputation(
         &mut self,
         message: &CellReputation,
@@ -79,7 +80,7 @@ impl UplinkState {
         }
     }
 
-    /// Tells the fuser what is new, and carries out the next steps on the link.
+    /// Sends new counts to the fuser, and carries out the next steps on the link.
     pub(super) fn exchange_reputations(&mut self) {
         if let Some(reputations) = self.exchange.take_news(clock::now()) {
             self.setup.fuser.send(FuserMessage::TakeForeign {
@@ -92,7 +93,8 @@ impl UplinkState {
         for step in self.exchange.next(clock::now(), MAX_MESSAGES) {
             match step {
                 ExchangeStep::Subscribe(filters) if !link.subscribe(&filters) => {
-                    // There is no room. Asked anew, the region tells anew.
+                    // There is no room. After a new subscription, the region sends its retained
+                    // messages again.
                     self.exchange.connect();
                     return;
                 }

@@ -1,4 +1,4 @@
-//! A printed board that lies on the ground, in a photograph: a QR code or a chessboard.
+//! Photographs of a printed board on the ground: a QR code or a chessboard.
 
 use ecod::perception::camera::Intrinsics;
 use nalgebra::Point2;
@@ -12,7 +12,7 @@ use crate::camera::detect::DetectError;
 use crate::camera::detect::placard::{Code, Pass, PlacardConfig, PlacardDetector};
 use crate::camera::lens::Lens;
 
-/// A board whose size is known.
+/// A board of given size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GroundBoard {
     /// A QR code.
@@ -46,10 +46,11 @@ pub enum BoardError {
     OpenCv(#[from] opencv::Error),
 }
 
-/// The camera over a board in an 8-bit gray photograph; `lens` is that of its frames. Poses are in the frame of the board.
+/// Fits the camera to a board in an 8-bit gray photograph; `lens` is the lens of its frames. Poses
+/// are in the frame of the board.
 ///
 /// # Errors
-/// [`BoardError`] when the board is not found or fits no camera.
+/// Returns a [`BoardError`] if the board is not found or fits no camera.
 pub fn fit_board(
     photograph: &Mat,
     board: &GroundBoard,
@@ -126,8 +127,9 @@ fn chessboard_places(board: &Chessboard) -> Vec<Point2<f64>> {
         .collect()
 }
 
-/// Corners of a code's three finder patterns in modules: rows and columns count from the upper left corner. Each pattern is
-/// a square of 7 modules around a light one of 5 and a dark one of 3 (ISO/IEC 18004).
+/// Corners of a code's three finder patterns in modules: rows and columns count from the upper left
+/// corner. Each pattern is a dark square of 7 modules that contains a light square of 5 and a dark
+/// square of 3 (ISO/IEC 18004).
 fn finder_modules(modules: f64) -> Vec<Point2<f64>> {
     let far = modules - 7.0;
     let patterns = [(0.0, 0.0), (far, 0.0), (0.0, far)];
@@ -142,7 +144,7 @@ fn finder_modules(modules: f64) -> Vec<Point2<f64>> {
     all.collect()
 }
 
-/// The same on the ground, in metres.
+/// These corners on the ground, in metres.
 fn finder_places(modules: f64, side_m: f64) -> Vec<Point2<f64>> {
     let module_m = side_m / modules;
     finder_modules(modules)
@@ -151,7 +153,8 @@ fn finder_places(modules: f64, side_m: f64) -> Vec<Point2<f64>> {
         .collect()
 }
 
-/// The same in the photograph: as the corners of the code put them, and then where the edges are.
+/// These corners in the photograph: estimated from the corners of the code, then refined at the
+/// edges.
 fn finder_corners(photograph: &Mat, code: &Code) -> opencv::Result<Vec<Point2<f64>>> {
     let single = |point: &Point2<f64>| Point2f::new(point.x as f32, point.y as f32);
     let n = code.modules;
@@ -169,7 +172,7 @@ fn finder_corners(photograph: &Mat, code: &Code) -> opencv::Result<Vec<Point2<f6
             .iter()
             .zip(corners.iter().skip(1))
             .map(|(a, b)| f64::from((a.x - b.x).hypot(a.y - b.y)));
-        // Within a module of each corner is no other.
+        // The distance to the next corner is more than a module.
         let reach = (sides.fold(f64::INFINITY, f64::min) / 3.0 * 0.7)
             .floor()
             .clamp(1.0, 10.0) as i32;
@@ -205,7 +208,7 @@ fn finder_corners(photograph: &Mat, code: &Code) -> opencv::Result<Vec<Point2<f6
 }
 
 const REFINEMENTS: usize = 3;
-/// Distance in pixels beyond which a refined corner is another one.
+/// Distance in pixels from which a refined corner must be a different corner.
 const OFF_PX: f64 = 1.5;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The mount of a camera from points on the ground whose places are known.
+//! The mount of a camera from points at given places on the ground.
 
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
@@ -60,7 +60,7 @@ pub enum GroundFitError {
         "the points fit a camera below the ground only: check that left and north are positive, and rows count downwards"
     )]
     BelowGround,
-    /// The points do not say enough.
+    /// The points do not determine the mount well enough.
     #[error(
         "the points leave the pitch open by ±{0:.1}°: spread them over the image, not on one line, and measure again"
     )]
@@ -78,15 +78,15 @@ const OUTLIER_SHARE: f64 = 0.008;
 const MIN_SIGMA_PX: f64 = 0.3;
 const RANSAC_ROUNDS: i32 = 2000;
 const RANSAC_CONFIDENCE: f64 = 0.999;
-/// Largest standard deviation in degrees of a pitch that is worth to be told.
+/// Maximum standard deviation in degrees of a pitch that is worth reporting.
 const MAX_PITCH_SIGMA_DEG: f64 = 5.0;
 
-/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane (Collins, Bartoli 2014)
-/// from the inliers, refined by Levenberg and Marquardt. Places are in any frame on the ground, x to y counter-clockwise
-/// from above.
+/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane
+/// (Collins, Bartoli 2014) from the inliers, refined by Levenberg and Marquardt. Places are in any
+/// frame on the ground, x to y counter-clockwise from above.
 ///
 /// # Errors
-/// [`GroundFitError`] when no camera fits, or several do.
+/// Returns a [`GroundFitError`] if no camera fits, or several do.
 pub fn fit_ground_points(
     points: &[GroundPoint],
     intrinsics: &Intrinsics,
@@ -207,7 +207,8 @@ fn solve(
     Ok(Some((pose, mount, inliers)))
 }
 
-/// Pose and mount from the rotation from the ground to the camera and the ground's origin in the camera.
+/// Pose and mount from the rotation from the ground to the camera and the ground's origin in the
+/// camera.
 fn from_extrinsics(from_ground: &Matrix3<f64>, origin: &Vector3<f64>) -> (Pose, Mount) {
     let to_ground = from_ground.transpose();
     let position = -(to_ground * origin);

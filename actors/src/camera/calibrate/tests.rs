@@ -41,7 +41,8 @@ fn flat_board() -> Mat {
     image
 }
 
-/// The board photographed from `distance_mm`, turned by the given angles, by an ideal 640x480 camera.
+/// The board photographed from `distance_mm`, turned by the given angles, by an ideal 640x480
+/// camera.
 fn photograph(flat: &Mat, turn: [f64; 3], shift_mm: [f64; 2], distance_mm: f64) -> Mat {
     let camera = Matrix3::new(FOCAL_PX, 0.0, 320.0, 0.0, FOCAL_PX, 240.0, 0.0, 0.0, 1.0);
     let [pitch, yaw, roll] = turn;

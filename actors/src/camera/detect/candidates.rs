@@ -1,4 +1,4 @@
-//! Boxes that networks find, and non-maximum suppression of those that show one object.
+//! Boxes found by networks, and non-maximum suppression of boxes that show the same object.
 
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::names::Label;
@@ -14,7 +14,8 @@ pub(super) struct ScoredBox {
 }
 
 impl ScoredBox {
-    /// The part of the box inside an image of that size; none if nothing is inside, or an edge is no number.
+    /// The part of the box inside an image of this size; `None` if the box is outside or an edge is
+    /// NaN.
     pub(super) fn inside(mut self, width: f64, height: f64) -> Option<Self> {
         let b = &mut self.bounds;
         (b.x_min, b.x_max) = (b.x_min.clamp(0.0, width), b.x_max.clamp(0.0, width));
@@ -34,8 +35,8 @@ impl ScoredBox {
     }
 }
 
-/// The best boxes of each class: of two that overlap by more than `max_overlap`, intersection over union, the lower score
-/// goes.
+/// The best boxes of each class: of two that overlap by more than `max_overlap`, intersection over
+/// union, the lower score goes.
 pub(super) fn suppress(
     mut candidates: Vec<ScoredBox>,
     max_overlap: f64,

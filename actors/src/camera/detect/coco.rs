@@ -1,7 +1,7 @@
 //! Detector of the 80 COCO classes: SSDLite-MobileNetV2 run by OpenCV.
 //!
-//! Feature `coco-weights` compiles the weights into the program; see `models/README.md` for their source, inputs and
-//! outputs.
+//! Feature `coco-weights` compiles the weights into the program; see `models/README.md` for their
+//! source, inputs and outputs.
 
 mod anchors;
 pub mod labels;
@@ -26,14 +26,16 @@ use crate::platform::installed;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CocoConfig {
-    /// ONNX file with the inputs and outputs of the built-in model. Default none: the built-in model.
+    /// ONNX file with the inputs and outputs of the built-in model. Default: not set, the built-in
+    /// model.
     pub model: Option<PathBuf>,
-    /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects and more false ones.
+    /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects
+    /// and more false ones.
     pub threshold: f64,
-    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5.
+    /// Intersection over union above which two boxes of one class are merged. Default 0.5.
     pub max_overlap: f64,
-    /// True if to also search four overlapping quarters of the image. Default false. Finds objects of
-    /// half the size and takes five times as long.
+    /// Whether to also search four overlapping quarters of the image. Default false. Finds objects
+    /// of half the size and takes five times as long.
     pub tiling: bool,
 }
 
@@ -52,7 +54,7 @@ impl CocoConfig {
     /// Checks every value; the model is checked when it is loaded.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("threshold", self.threshold, 0.01, 1.0)?;
         check_range("max_overlap", self.max_overlap, 0.0, 1.0)
@@ -65,13 +67,13 @@ pub enum ModelError {
     /// The file cannot be read.
     #[error("cannot read model {path:?}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
-    /// The program has no weights inside or beside it, and no file is configured.
+    /// The program has no built-in or installed weights, and no file is configured.
     #[error(
         "there are no weights for coco: install the package ecod-node-coco, or set `model` to a file, such as \
          models/ssdlite_mobilenet_v2_coco.onnx"
@@ -84,7 +86,7 @@ pub enum ModelError {
     Unusable {
         /// The file, or `built-in`.
         path: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
 }
@@ -102,9 +104,11 @@ const PACKAGED: &str = "share/ecod-node/models/ssdlite_mobilenet_v2_coco.onnx";
 
 /// Side of the network's input in pixels.
 const INPUT_PX: i32 = 300;
-/// Side of a tile as a share of the image's side: neighbouring tiles overlap by a fifth of the image.
+/// Side of a tile as a share of the image's side: neighbouring tiles overlap by a fifth of the
+/// image.
 const TILE_SHARE: f64 = 0.6;
-/// Distance from a tile's inner edge, as a share of the tile's side, below which a box counts as cut.
+/// Distance from a tile's inner edge, as a share of the tile's side, below which a box counts as
+/// cut.
 const CUT_SHARE: f64 = 0.02;
 
 /// Detector of COCO objects.
@@ -118,14 +122,14 @@ impl CocoDetector {
     /// Loads the model and runs it once to check it.
     ///
     /// # Errors
-    /// [`ModelError`] naming the file.
+    /// Returns a [`ModelError`] that names the file.
     pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
         let packaged = || installed::path(PACKAGED).filter(|_| BUILT_IN.is_none());
         let file = config.model.clone().or_else(packaged);
         let name = file
             .as_ref()
             .map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
-        // OpenCV tells more in further lines.
+        // OpenCV gives more details in further lines.
         let first_line = |reason: String| reason.lines().next().unwrap_or_default().to_owned();
         let unusable = |reason: String| ModelError::Unusable {
             path: name.clone(),

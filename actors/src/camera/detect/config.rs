@@ -62,7 +62,7 @@ impl DetectorConfig {
     /// Checks every value; files are checked when they are opened.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
             Self::Placard(config) => config.validate(),
@@ -75,7 +75,7 @@ impl DetectorConfig {
     /// Loads the detector.
     ///
     /// # Errors
-    /// When a file of the detector cannot be used; the error names it.
+    /// Returns an error if a file of the detector cannot be used; the error names it.
     pub fn build(&self) -> anyhow::Result<Box<dyn Detect>> {
         Ok(match self {
             Self::Placard(config) => Box::new(PlacardDetector::new(config.clone())),

@@ -1,7 +1,7 @@
 //! Detector that runs an exported model: YOLO, SSD and DETR families, in ONNX.
 //!
-//! The file says the input's size and often the labels. One run on a plain image shows the shapes of the outputs, which
-//! tell the family.
+//! The file contains the input's size and often the labels. One run on a plain image shows the
+//! shapes of the outputs, which identify the family.
 
 mod decode;
 mod family;
@@ -34,16 +34,17 @@ use crate::platform::bounded_file;
 pub struct OnnxConfig {
     /// The model's ONNX file.
     pub model: PathBuf,
-    /// File with the label of each class on a line. Default none: labels of the model's metadata, or COCO's.
+    /// File with the label of each class on its own line. Default: not set; the labels are taken
+    /// from the model's metadata, or are COCO's.
     #[serde(default)]
     pub labels: Option<PathBuf>,
-    /// Family of the model. Default none: found by its outputs.
+    /// Family of the model. Default: not set; detected from its outputs.
     #[serde(default)]
     pub family: Option<Family>,
-    /// Width and height of the network's input in pixels. Default none: those of the model.
+    /// Width and height of the network's input in pixels. Default: not set; taken from the model.
     #[serde(default)]
     pub input_px: Option<[u16; 2]>,
-    /// Values of pixels. Default none: those of the family.
+    /// Range of pixel values. Default: not set; the family's values.
     #[serde(default)]
     pub normalization: Option<Normalization>,
     /// Minimum confidence of a detection. Default 0.4.
@@ -52,8 +53,8 @@ pub struct OnnxConfig {
     /// Minimum confidence by label, in place of `threshold`.
     #[serde(default)]
     pub thresholds: BTreeMap<String, f64>,
-    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5. Not for models
-    /// that suppress such boxes themselves.
+    /// Intersection over union above which two boxes of one class are merged. Default 0.5. Not for
+    /// models that suppress such boxes themselves.
     #[serde(default = "default_max_overlap")]
     pub max_overlap: f64,
 }
@@ -84,7 +85,7 @@ impl OnnxConfig {
     /// Checks every value; files are checked when they are loaded.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for side in self.input_px.into_iter().flatten() {
             check_range("input_px", f64::from(side), 32.0, 4096.0)?;
@@ -114,9 +115,9 @@ pub enum OnnxError {
         "model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators"
     )]
     NotRunnable {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
-        /// The runtime's words.
+        /// Error message of the runtime.
         reason: String,
     },
     /// The network does not take one image.
@@ -124,17 +125,17 @@ pub enum OnnxError {
         "model {path:?} takes {inputs}; export it for one image, such as images tensor(f32) [1, 3, 640, 640]"
     )]
     UnknownInputs {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Names, types and shapes.
         inputs: String,
     },
-    /// The file says no size of the image.
+    /// The file does not contain the size of the image.
     #[error(
         "model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]"
     )]
     AnySize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
     },
     /// The network takes another size than the configured one.
@@ -142,7 +143,7 @@ pub enum OnnxError {
         "model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size"
     )]
     OtherSize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Size of the network.
         taken: ImageSize,
@@ -154,11 +155,11 @@ pub enum OnnxError {
         "model {path:?} fails with an image of {size}: {reason}; try sides that are multiples of 32 in `input_px`"
     )]
     RefusedSize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Size of the image.
         size: ImageSize,
-        /// The runtime's words.
+        /// Error message of the runtime.
         reason: String,
     },
     /// The outputs fit no family, or not the configured one.
@@ -167,7 +168,7 @@ pub enum OnnxError {
          docs/cameras.md lists the shapes"
     )]
     UnknownOutputs {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Names and shapes.
         outputs: String,
@@ -181,10 +182,10 @@ pub enum OnnxError {
         "model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`"
     )]
     InPixels {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
     },
-    /// The count of labels is not that of the classes.
+    /// The number of labels differs from the number of classes.
     #[error(
         "{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order"
     )]
@@ -204,12 +205,12 @@ pub enum OnnxError {
         /// The name.
         label: String,
     },
-    /// No labels are known.
+    /// No labels are available.
     #[error(
         "model {path:?} has {classes} classes without names: set `labels` to a file with one on each line"
     )]
     NoLabels {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Count of classes.
         classes: usize,
@@ -217,7 +218,7 @@ pub enum OnnxError {
     /// A threshold is for a label that the model does not have.
     #[error("`thresholds` names {label:?}, but the labels of model {path:?} are {labels}")]
     UnknownLabel {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// The label.
         label: String,
@@ -238,7 +239,7 @@ pub struct OnnxDetector {
     config: OnnxConfig,
     network: Network,
     head: Head,
-    /// By the network's numbers; none for numbers that are no class.
+    /// By the network's numbers; `None` for numbers without a class.
     classes: Vec<Option<Class>>,
 }
 
@@ -246,7 +247,7 @@ impl OnnxDetector {
     /// Loads the model and runs it once to see its outputs.
     ///
     /// # Errors
-    /// [`OnnxError`] with the file and the remedy.
+    /// Returns an [`OnnxError`] with the file and the remedy.
     pub fn new(config: OnnxConfig) -> Result<Self, OnnxError> {
         let path = &config.model;
         let told = config.input_px.map(|[width, height]| ImageSize {
@@ -376,7 +377,7 @@ impl Detect for OnnxDetector {
     }
 }
 
-/// Names of the classes in their order, if they are known, and their file.
+/// Names of the classes in their order, if available, and their file.
 fn names(
     config: &OnnxConfig,
     network: &Network,

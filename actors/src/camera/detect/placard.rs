@@ -1,7 +1,7 @@
 //! Detector of placards: square QR codes that name a slot or a vehicle, read by zxing-cpp.
 //!
-//! Each pass reads the frame at a larger size. Codes that were read are painted over before the next pass, so that no
-//! code is read twice.
+//! Each pass reads the frame at a larger size. Codes that were read are painted over before the
+//! next pass, so that no code is read twice.
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::{BoundingBox, Detection};
@@ -20,8 +20,8 @@ use crate::camera::frame::CameraFrame;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlacardConfig {
-    /// Enlargements of the frame, cheapest first. Default 1x1, 2x2 and 4x2. Trade-off: more passes read smaller and more
-    /// slanted codes; the time of a pass grows with its area.
+    /// Enlargements of the frame, cheapest first. Default 1x1, 2x2 and 4x2. Trade-off: more passes
+    /// read smaller and more slanted codes; the time of a pass grows with its area.
     pub passes: Vec<Pass>,
     /// Maximum number of codes in one frame, 1 to 255. Default 32. Reaching it ends the passes.
     pub max_codes: u8,
@@ -31,7 +31,8 @@ pub struct PlacardConfig {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pass {
-    /// Horizontal enlargement, 1 to 4. Slanted views make codes narrow, so this is usually the larger one.
+    /// Horizontal enlargement, 1 to 4. Slanted views make codes narrow, so this is usually the
+    /// larger one.
     pub stretch_x: f64,
     /// Vertical enlargement, 1 to 4.
     pub stretch_y: f64,
@@ -54,7 +55,7 @@ impl PlacardConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if !(1..=MAX_PASSES).contains(&self.passes.len()) {
             return Err(ConfigError::new(
@@ -90,13 +91,15 @@ const CONFIDENCES: (f64, f64) = (0.5, 0.99);
 
 /// Detector of placards.
 ///
-/// Error correction of the code makes wrong texts very rare. Confidence therefore describes the corners: it rises from
-/// 0.5 for modules of one pixel along the code's shortest side to 0.99 for modules of four pixels.
+/// Error correction of the code makes wrong texts very rare. Confidence therefore describes the
+/// corners: it rises from 0.5 for modules of one pixel along the code's shortest side to 0.99 for
+/// modules of four pixels.
 ///
-/// The decoder extrapolates the lower right corner, which has no finder pattern. In codes of version 1 it is typically
-/// off by 0.45 modules, the other corners by 0.2.
+/// The decoder extrapolates the lower right corner, which has no finder pattern. In codes of
+/// version 1 it is typically off by 0.45 modules, the other corners by 0.2.
 ///
-/// Texts that cannot be a label are skipped: empty, longer than 64 bytes, not UTF-8, or with control characters.
+/// Texts that cannot be a label are skipped: empty, longer than 64 bytes, not UTF-8, or with
+/// control characters.
 pub struct PlacardDetector {
     config: PlacardConfig,
 }
@@ -170,8 +173,9 @@ pub(crate) struct Code {
 }
 
 impl Code {
-    /// zxing-cpp puts the centre of the first pixel at (0.5, 0.5) and rounds the outer corners of the code to whole
-    /// numbers; enlarging by OpenCV keeps the edges of the image in place, so both coordinates only scale.
+    /// zxing-cpp puts the centre of the first pixel at (0.5, 0.5) and rounds the outer corners of
+    /// the code to whole numbers; enlarging by OpenCV keeps the edges of the image in place, so
+    /// both coordinates only scale.
     fn of(barcode: &Barcode, pass: Pass) -> Self {
         let position = barcode.position();
         let corners = [

@@ -1,7 +1,8 @@
-//! Detections from a file, in place of a detector: for recordings and for nodes without a usable model.
+//! Detections from a file instead of a detector: for recordings and for nodes without a usable
+//! model.
 //!
-//! The file is JSON Lines: line n holds what was detected in frame n, as an array of
-//! [`ecod::model::detection::Detection`]s, empty when nothing was:
+//! The file is JSON Lines: line n holds the detections of frame n as an array of
+//! [`ecod::model::detection::Detection`]s, which may be empty:
 //!
 //! ```text
 //! [{"label":"cup","confidence":0.93,"bounding_box":{"x_min":12.5,"y_min":80,"x_max":96,"y_max":171}}]
@@ -17,13 +18,13 @@ use super::{Detect, DetectError};
 use crate::camera::frame::CameraFrame;
 use crate::platform::bounded_file;
 
-/// Where recorded detections come from.
+/// Source of recorded detections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedConfig {
     /// The JSON Lines file.
     pub path: PathBuf,
-    /// True if to start again after the last line; default false: nothing is detected from then on.
+    /// Whether to start again after the last line; default false: later frames have no detections.
     #[serde(default)]
     pub looping: bool,
 }
@@ -34,7 +35,7 @@ pub enum RecordingError {
     /// The file cannot be read.
     #[error("cannot read recorded detections {path:?}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The system's error.
         #[source]
@@ -43,7 +44,7 @@ pub enum RecordingError {
     /// A line is not an array of detections.
     #[error("recorded detections {path:?}, line {line}: {reason}")]
     Malformed {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Line number, from 1.
         line: usize,
@@ -64,7 +65,7 @@ impl RecordedDetector {
     /// Reads the whole recording.
     ///
     /// # Errors
-    /// [`RecordingError`] naming the file and the first bad line.
+    /// Returns a [`RecordingError`] that names the file and the first bad line.
     pub fn open(config: &RecordedConfig) -> Result<Self, RecordingError> {
         let path = &config.path;
         let text = bounded_file::read_text(path).map_err(|source| RecordingError::Unreadable {

@@ -1,11 +1,12 @@
-//! Runs a source on its own threads: the latest frame wins, and a source that fails or stalls is reopened.
+//! Runs a source on its own threads: the latest frame wins, and a source that fails or stalls is
+//! reopened.
 //!
 //! ```text
 //! reader thread (one per opening) --frames, errors--> capture thread --latest frame--> slot --> detector
 //! ```
 //!
-//! A driver or a file system may block forever. The capture thread then abandons the reader, which ends when that returns, and
-//! reopens the source on a new one.
+//! A driver or a file system may block forever. The capture thread then abandons the reader, which
+//! ends when that returns, and reopens the source on a new one.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};
@@ -25,7 +26,8 @@ use crate::platform::latest_slot::LatestSlot;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CaptureConfig {
-    /// Seconds without a frame after which a source is reopened. Default 5. Must exceed the start time of the camera.
+    /// Seconds without a frame after which a source is reopened. Default 5. Must exceed the start
+    /// time of the camera.
     pub stall_timeout_s: f64,
     /// Seconds before the first retry. Default 0.5. Doubles with each failure in a row.
     pub retry_min_s: f64,
@@ -47,7 +49,7 @@ impl CaptureConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("stall_timeout_s", self.stall_timeout_s, 0.01, 3600.0)?;
         check_range("retry_min_s", self.retry_min_s, 0.001, 3600.0)?;
@@ -100,7 +102,7 @@ impl Capture {
     /// Starts to capture. `open` is called on threads of the capture.
     ///
     /// # Errors
-    /// When the operating system gives no thread.
+    /// Returns an error if the operating system gives no thread.
     pub fn start(open: Opener, config: CaptureConfig) -> std::io::Result<Self> {
         let slot = Arc::new(LatestSlot::default());
         let (status_sender, status) = watch::channel(CaptureStatus::default());
@@ -134,7 +136,8 @@ impl Capture {
         })
     }
 
-    /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
+    /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source
+    /// is reopened.
     pub async fn next_frame(&self) -> Option<CameraFrame> {
         self.slot.take().await
     }
@@ -172,18 +175,19 @@ impl Drop for Capture {
     }
 }
 
-/// Number of running readers. They may be inside OpenCV, which must not be in use while the process ends.
+/// Number of running readers. They may be inside OpenCV, which must not be in use while the process
+/// ends.
 #[derive(Debug, Clone, Default)]
 pub struct Readers(Arc<AtomicUsize>);
 
 impl Readers {
-    /// Those of all captures in this process.
+    /// The readers of all captures in this process.
     pub fn of_process() -> &'static Self {
         static ALL: LazyLock<Readers> = LazyLock::new(Readers::default);
         &ALL
     }
 
-    /// Waits at most `timeout` until none runs.
+    /// Waits at most `timeout` until all readers have ended.
     pub fn wait_for_end(&self, timeout: Duration) {
         let until = Instant::now() + timeout;
         while self.0.load(Ordering::SeqCst) > 0 && Instant::now() < until {
@@ -234,7 +238,7 @@ struct CaptureLoop {
     status: watch::Sender<CaptureStatus>,
     events: SyncSender<CaptureEvent>,
     inbox: Receiver<CaptureEvent>,
-    /// Number of the present opening and its reader.
+    /// Number of the current opening and its reader.
     opening: Arc<AtomicU64>,
     abandoned: Vec<JoinHandle<()>>,
     captured: u64,

@@ -1,4 +1,5 @@
-//! Cameras of the kernel (Video4Linux), such as USB cameras: buffers that the driver fills, converted to BGR.
+//! Cameras of the kernel (Video4Linux), such as USB cameras: buffers that the driver fills,
+//! converted to BGR.
 
 mod pixels;
 
@@ -31,7 +32,8 @@ pub(super) struct V4l2Camera {
 }
 
 impl V4l2Camera {
-    /// Opens a device in the first pixel format of [`pixels`] that it has. It takes the nearest size and rate that it has.
+    /// Opens a device in the first pixel format of [`pixels`] that it supports. The device uses the
+    /// nearest size and rate that it supports.
     pub(super) fn open(
         device: &Path,
         size: [Option<u32>; 2],

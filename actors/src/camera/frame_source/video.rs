@@ -1,15 +1,16 @@
-//! Videos, network cameras and pipelines: frames of the program `ecod-video`, which alone has OpenCV's `videoio`.
+//! Videos, network cameras and pipelines: frames of the program `ecod-video`, the only program that
+//! is linked to OpenCV's `videoio`.
 //!
-//! In Debian `videoio` loads some 200 libraries, 80 MB. In a process of its own it costs nothing where no source needs it, and what
-//! crashes or hangs in it does the node no harm.
+//! In Debian `videoio` loads some 200 libraries, 80 MB. In a process of its own it is loaded only
+//! if a source needs it, and crashes or hangs in it do not affect the node.
 //!
 //! ```text
 //! node --VideoRequest, a line of JSON----------------------------> ecod-video
 //! node <--VideoMessage, a line of JSON; a frame's pixels after it-- ecod-video
 //! ```
 //!
-//! The program ends when its standard input does, so also when the node is killed. What it and its libraries write to standard error
-//! are debug lines of the node's log.
+//! The program ends when its standard input closes, which also happens when the node is killed. Its
+//! standard error, including output of its libraries, becomes debug lines of the node's log.
 
 pub mod program;
 mod protocol;
@@ -34,7 +35,8 @@ use crate::platform::{clock, installed};
 /// Name of the program.
 const PROGRAM: &str = "ecod-video";
 
-/// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on a machine.
+/// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on
+/// a machine.
 const MIN_OPEN_TIME: Duration = Duration::from_secs(30);
 
 /// Maximum number of pixels of a frame: 8K.
@@ -43,7 +45,7 @@ const MAX_PIXELS: i64 = 7680 * 4320;
 /// Maximum length of a message in bytes, without a frame's pixels.
 const MAX_LINE: u64 = 64 * 1024;
 
-/// Time for a program that is gone to hand over its last words.
+/// Time for a program that has ended to deliver its last lines.
 const LAST_WORDS_TIME: Duration = Duration::from_millis(200);
 
 /// A running `ecod-video` and the frames that it writes.
@@ -57,8 +59,8 @@ pub(super) struct VideoProcess {
 }
 
 impl VideoProcess {
-    /// Starts the program and waits until it has opened the source. After `timeout` it gives up a network camera by itself; here
-    /// twice that time without a frame is an error.
+    /// Starts the program and waits until it has opened the source. The program gives up on a
+    /// network camera after `timeout`; here, twice that time without a frame is an error.
     pub(super) fn open(source: &SourceConfig, timeout: Duration) -> Result<Self, FrameError> {
         let origin = source.origin();
         let failed = |reason: String| FrameError::Open {
@@ -86,7 +88,7 @@ impl VideoProcess {
         let (Some(stdin), Some(stdout), Some(stderr)) = pipes else {
             return Err(failed(format!("no pipes to {PROGRAM}")));
         };
-        // If the program is gone already, its end says why.
+        // If the program has already ended, its exit status gives the reason.
         let _ = protocol::write_line(
             stdin,
             &VideoRequest {
@@ -162,9 +164,10 @@ impl VideoProcess {
         }
     }
 
-    /// The end of the program, with its status and last words.
+    /// The error for the end of the program, with its status and last lines.
     fn end(&mut self) -> FrameError {
-        // It may have closed its output and go on; of a program that is gone, the status stays.
+        // The program may have closed its output and continue to run; if it has ended, the status
+        // is unaffected.
         let _ = self.child.0.kill();
         let status = self
             .child
@@ -209,7 +212,7 @@ impl Drop for ProgramGuard {
     }
 }
 
-/// Standard output of the program, of which each read ends at a deadline.
+/// Standard output of the program; each read has a deadline.
 struct DeadlineReader {
     stdout: ChildStdout,
     deadline: Instant,
@@ -226,7 +229,7 @@ impl Read for DeadlineReader {
     }
 }
 
-/// Standard error of the program: logged line by line, and the last line kept.
+/// Standard error of the program: logged line by line, with the last line kept.
 struct LastWords {
     line: Arc<Mutex<String>>,
     ended: Receiver<()>,
@@ -242,9 +245,9 @@ impl LastWords {
         Ok(Self { line, ended })
     }
 
-    /// The last line, once there is no more or time is up.
+    /// The last line, after the end of the output or the timeout.
     fn wait(&self) -> String {
-        // Nothing is ever sent.
+        // Returns when the reader ends, because no message is sent.
         let _ = self.ended.recv_timeout(LAST_WORDS_TIME);
         self.line
             .lock()
@@ -263,7 +266,8 @@ fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<
     }
 }
 
-/// A text that may be logged: addresses without login and query, and no value of a property such as `user-pw`.
+/// A text that may be logged: addresses without login and query, and without values of properties
+/// such as `user-pw`.
 pub(super) fn without_credentials(text: &str) -> String {
     #[expect(clippy::expect_used, reason = "the expressions are constants")]
     static SECRETS: LazyLock<[(Regex, &str); 3]> = LazyLock::new(|| {

@@ -24,7 +24,7 @@ fn is_near(color: [u8; 3], expected: [u8; 3]) -> bool {
     color.iter().zip(expected).all(|(a, b)| a.abs_diff(b) <= 6)
 }
 
-/// An EXIF segment of a JPEG file that says only this orientation.
+/// An EXIF segment of a JPEG file that contains only this orientation.
 fn exif(orientation: u8) -> Vec<u8> {
     let tiff = [
         b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),

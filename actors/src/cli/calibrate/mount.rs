@@ -1,4 +1,5 @@
-//! `ecod-node calibrate mount`: height and tilt of a camera, and its place if the points say it.
+//! `ecod-node calibrate mount`: height and tilt of a camera, and its place if the points determine
+//! it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -34,19 +35,20 @@ use crate::platform::bounded_file;
 pub(super) enum MountCommand {
     /// From four or more points on the ground: pixel and place of each
     Points(PointsArguments),
-    /// From a photograph of a QR code or chessboard that lies on the ground
+    /// From a photograph of a QR code or chessboard on the ground
     Board(GroundBoardArguments),
-    /// From people who walk before the camera, by the node's own source and detector
+    /// From people who walk in front of the camera, with the node's own source and detector
     People(PeopleArguments),
 }
 
 /// Flags of all three.
 #[derive(Debug, Args)]
 struct MountArguments {
-    /// Configuration of the node (TOML), which says the optics; measurements are in pixels of its frames
+    /// Configuration of the node (TOML), which contains the optics; measurements are in pixels of
+    /// its frames
     #[arg(long, value_name = "FILE")]
     config: PathBuf,
-    /// Name of the camera, of several. Default that of `[camera]`
+    /// Name of the camera, if there are several. Default: the name in `[camera]`
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
     /// Write the mount into that file as well
@@ -59,13 +61,16 @@ struct MountArguments {
 pub(super) struct PointsArguments {
     #[command(flatten)]
     node: MountArguments,
-    /// A point: column and row in pixels, metres ahead and to the left of the vehicle's reference point
+    /// A point: column and row in pixels, metres ahead and to the left of the vehicle's reference
+    /// point
     #[arg(long = "point", value_name = "COLUMN,ROW=AHEAD,LEFT", value_parser = measured_point)]
     points: Vec<MeasuredPoint>,
-    /// The picture in which the points were measured, whose size counts. Default the size of `camera.optics`
+    /// The picture in which the points were measured, whose size counts. Default the size of
+    /// `camera.optics`
     #[arg(long, value_name = "IMAGE")]
     image: Option<PathBuf>,
-    /// Places are metres east and north in the cell's frame; `pose` of the configuration says where the vehicle stands
+    /// Places are metres east and north in the cell's frame; the vehicle's position is `pose` in
+    /// the configuration
     #[arg(long)]
     in_map: bool,
     /// File of more points, four numbers a line; lines that begin with # are left out
@@ -111,7 +116,7 @@ pub(super) struct PeopleArguments {
     /// Seconds to watch
     #[arg(long, value_name = "SECONDS", default_value_t = 60.0)]
     for_s: f64,
-    /// Height with shoes in metres, if one person walks who is known. Default the usual size of people
+    /// Height with shoes in metres, if a single person walks. Default: the usual size of people
     #[arg(long, value_name = "METRES")]
     height_m: Option<f64>,
     /// The detector's label of people
@@ -119,7 +124,7 @@ pub(super) struct PeopleArguments {
     label: String,
 }
 
-/// Relative standard deviation of the height of one known person.
+/// Relative standard deviation of the given height of one person.
 const KNOWN_HEIGHT_SIGMA: f64 = 0.02;
 
 /// Maximum time for the camera to end.
@@ -179,7 +184,7 @@ impl MountArguments {
         Ok((config, camera, lens))
     }
 
-    /// Prints the mount to paste into a configuration, and writes it there if told to.
+    /// Prints the mount to paste into a configuration, and writes it there if requested.
     fn tell(&self, estimate: &MountEstimate, lens: &Lens) -> Result<(), Failure> {
         print(&mount_table(estimate, self.camera.is_some()).context("the mount as TOML")?)?;
         if let Some([near_m, far_m]) = estimate.mount.ground_in_view(&lens.intrinsics) {
@@ -456,7 +461,7 @@ impl PeopleArguments {
     }
 }
 
-/// Findings in a camera's frames.
+/// Results from a camera's frames.
 struct Watched {
     /// Whole boxes of people by frame, without distortion.
     people: Vec<Vec<BoundingBox>>,

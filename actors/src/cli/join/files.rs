@@ -26,10 +26,12 @@ const STATE_DIRECTORY: &str = "/var/lib/ecod";
 const CITY_CA: &str = "city.pem";
 const CITY_LIST: &str = "city-revoked.pem";
 
-/// A directory with the files of a node; on the machine that has made the cell, also those of the CA.
+/// A directory with the files of a node; on the machine that created the cell, it also contains the
+/// files of the CA.
 pub(super) struct NodeDirectory {
     path: PathBuf,
-    /// Directory of the service's state, if these are the service's files; its owner is the service's user.
+    /// Directory of the service's state, if these are the service's files; its owner is the
+    /// service's user.
     state_of_service: Option<PathBuf>,
 }
 
@@ -52,7 +54,7 @@ struct MembershipSection<'a> {
 }
 
 impl NodeDirectory {
-    /// The given directory, or the usual one of this user; it is made if it is missing.
+    /// The given directory, or this user's default directory; it is created if missing.
     pub(super) fn new(given: Option<&Path>) -> anyhow::Result<Self> {
         let is_root = fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
         let usual = if is_root { SERVICE_DIRECTORY } else { "ecod" };
@@ -68,9 +70,9 @@ impl NodeDirectory {
         })
     }
 
-    /// Checks that no node has its files here.
+    /// Checks that the directory contains no node's files.
     pub(super) fn check_vacant(&self) -> anyhow::Result<()> {
-        // It is written last: what an attempt that failed has left is overwritten.
+        // This file is written last: files left by a failed attempt are overwritten.
         let path = self.path.join("cell.key");
         ensure!(
             !path.exists(),
@@ -124,8 +126,8 @@ impl NodeDirectory {
             .with_context(|| format!("cannot read the cell's key {}", path.display()))
     }
 
-    /// Writes all files of a node, and checks that they fit together. A configuration that is there, such as that of
-    /// the package, is kept as `node.toml.1`, or with the next free number.
+    /// Writes all files of a node, and checks their consistency. An existing configuration, such as
+    /// the package's, is kept as `node.toml.1`, or with the next free number.
     pub(super) fn write(
         &self,
         node: &NodeName,
@@ -166,7 +168,7 @@ impl NodeDirectory {
             kept.transpose()
                 .context("cannot keep the former node.toml")?;
         }
-        // Programs of the service's group speak for the node, and are no members.
+        // Programs of the service's group may use the node's local broker, but are not members.
         let key_mode = if self.state_of_service.is_some() {
             0o640
         } else {
@@ -178,7 +180,7 @@ impl NodeDirectory {
                 (CITY_LIST, city.revocation_list.as_str(), 0o644),
             ]
         });
-        // The cell's key last: it is what makes the directory a node's.
+        // The cell's key is written last, because it marks the directory as a node's.
         let files = of_city.chain([
             ("ca.pem", welcome.ca.as_str(), 0o644),
             ("node.pem", welcome.certificate.as_str(), 0o644),
@@ -204,7 +206,8 @@ impl NodeDirectory {
         Ok(())
     }
 
-    /// Has the system run the node from now on, if it is the system's: true if so.
+    /// Makes the system run the node from now on, if it is the system's node; returns true in that
+    /// case.
     pub(super) fn enable_service(&self) -> anyhow::Result<bool> {
         let units = ["/lib/systemd/system", "/etc/systemd/system"];
         let has_unit = units
@@ -216,7 +219,7 @@ impl NodeDirectory {
         {
             return Ok(false);
         }
-        // One that runs already has another configuration.
+        // A running service still has its previous configuration.
         for command in ["enable", "restart"] {
             let done = Command::new("systemctl")
                 .args([command, "ecod-node"])

@@ -1,4 +1,5 @@
-//! Replay of logs: from the aggregator's journal if there is one, else from an observer's reports.
+//! Replay of logs: from the aggregator's journal if there is one, otherwise from an observer's
+//! reports.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,7 +26,7 @@ const LIMITS: Limits = Limits {
 enum ReplayEngine {
     /// From the aggregator's journal.
     Journal(Box<JournalReplay>),
-    /// From reports by their time of receipt.
+    /// From reports, ordered by their time of receipt.
     Reports(Box<Replay>),
 }
 
@@ -38,7 +39,7 @@ pub(super) struct LogReplay<'a> {
     /// Chosen by the first journal entry or report.
     engine: Option<ReplayEngine>,
     unreadable: BTreeMap<RejectReason, u64>,
-    /// Reports of the fusions that have ended, and unreadable ones.
+    /// Counts of reports of the completed fusions, and of unreadable reports.
     usable: Usable,
 }
 
@@ -54,8 +55,8 @@ impl<'a> LogReplay<'a> {
         }
     }
 
-    /// Reads the files and writes their rounds. Unusable parts are reported and skipped. Gives nothing for a journal, and
-    /// if the reader of the output closed it.
+    /// Reads the files and writes their rounds. Unusable parts are reported and skipped. Returns
+    /// `None` for a journal, and if the reader of the output closed it.
     pub(super) fn run(
         mut self,
         files: &[PathBuf],
@@ -215,7 +216,8 @@ impl<'a> LogReplay<'a> {
             }
             Some(ReplayEngine::Journal(rerun)) => {
                 print_rerun(&rerun);
-                // What the live aggregator rejected is part of its journal, and it may have fused nothing.
+                // Reports that the live aggregator rejected are part of its journal, which may
+                // contain no fused report.
                 return rounds.finish().map(|()| None);
             }
         }
@@ -245,7 +247,7 @@ pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
 fn end(replay: Replay, usable: &mut Usable) -> Vec<FusedLine> {
     let (lines, summary) = replay.finish();
     print_summary(&summary);
-    // An observer hears every report at two brokers.
+    // An observer receives every report from two brokers.
     *usable = usable.plus(Usable::of(&summary, true));
     lines
 }

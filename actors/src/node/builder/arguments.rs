@@ -1,4 +1,4 @@
-//! What each part is given at its start.
+//! Arguments of each part at its start.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -65,7 +65,7 @@ impl NodeBuilder {
             role: self.config.role,
             broker: *self.broker_address.borrow(),
             credentials: self.security.credentials.clone(),
-            // Others look for it where it was.
+            // Other nodes expect the membership at its former address.
             config: MembershipConfig {
                 bind: self.gossip_address.borrow().or(membership.bind),
                 ..membership.clone()
@@ -106,7 +106,7 @@ impl NodeBuilder {
         }
     }
 
-    /// The identity of the node's log; `record.name` stands for the node's name where it is set.
+    /// The identity of the node's log; `record.name` replaces the node's name if it is set.
     fn log_identity(&self) -> LogIdentity {
         let NodeConfig {
             cell,
@@ -136,8 +136,8 @@ impl NodeBuilder {
         })
     }
 
-    /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
-    /// order in which they are fused.
+    /// Passes incoming messages to the responsible parts. Reports are recorded by the fuser if
+    /// there is one, in the order in which they are fused.
     fn subscriber(&self) -> Subscriber {
         let ActorSlots {
             fuser,
@@ -177,7 +177,8 @@ impl NodeBuilder {
                     }
                     true
                 }
-                // Evidence is for those that lead now or next; others that get it only look at it.
+                // Evidence is for current and future leaders; other nodes that receive it only
+                // display it.
                 Incoming::Report { report, .. }
                     if live_state.wants_reports()
                         && report.node.vehicle() != name
@@ -252,7 +253,7 @@ impl NodeBuilder {
                     };
                     election.send(LeaderElectionMessage::Note { input })
                 }
-                // Pages alone go by it.
+                // Only pages use it.
                 Incoming::StatusWithdrawn { .. } => true,
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
@@ -326,7 +327,7 @@ impl NodeBuilder {
         }
     }
 
-    /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
+    /// A fuser starts with the keeper's evidence, and continues with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
         let (now, ledger) = (
@@ -461,7 +462,7 @@ impl NodeBuilder {
         }
     }
 
-    /// The way of programs beside the node into the cell.
+    /// The connection of local programs to the cell.
     pub(super) fn new_door(&self) -> Door {
         if !self.config.broker.door {
             return Door::default();
@@ -538,7 +539,7 @@ impl NodeBuilder {
         ))
     }
 
-    /// The node's status when a part starts, also anew: it follows whom it followed before.
+    /// The node's status when a part starts or restarts: it follows the same leader as before.
     pub(super) fn status(&self) -> NodeStatus {
         let newest = self.newest.map.borrow();
         let taken = newest

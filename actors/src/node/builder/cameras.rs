@@ -60,7 +60,8 @@ impl NodeBuilder {
         })
     }
 
-    /// Tells the projectors of changed settings, unless they are those of the vehicle's present node in another cell.
+    /// Sends changed settings to the projectors, unless the projectors belong to the vehicle's
+    /// present node in another cell.
     pub(super) fn configure_cameras(&self) {
         if self.presence < Presence::Reporting {
             return;
@@ -107,7 +108,8 @@ impl NodeBuilder {
         CameraTroubles::new(self.counters(), part)
     }
 
-    /// The pose of a vehicle that stands still, if it has a place in the cell's frame. The log says why it has none.
+    /// The pose of a vehicle that stands still, if it has a place in the cell's frame. Otherwise
+    /// the log contains the reason.
     fn standing_pose(&self) -> Option<ecod::model::geometry::Pose> {
         camera::standing_pose(&self.config).unwrap_or_else(|error| {
             tracing::error!(

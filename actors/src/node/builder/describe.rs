@@ -14,8 +14,9 @@ use crate::node::description::{HeldDescription, rates_by_evidence, shared_facts}
 use crate::node::slots::ActorKind;
 
 impl NodeBuilder {
-    /// Uses a description from now on. One that contradicts the node's own configuration, or that this version cannot read,
-    /// is kept and passed on, and the node goes on with the settings that it has.
+    /// Uses a description from now on. A description that contradicts the node's own configuration,
+    /// or that this version cannot read, is stored and distributed, but the node continues with its
+    /// current settings.
     pub(in crate::node) fn describe(&mut self, description: &Arc<CellDescription>) {
         self.held = HeldDescription {
             description: Some(Arc::clone(description)),
@@ -41,7 +42,7 @@ impl NodeBuilder {
             .send(LeaderElectionMessage::Note { input });
     }
 
-    /// Notes values that look as if they were in another unit.
+    /// Records values that look as if they were in another unit.
     pub(super) fn note_units(&self) {
         let troubles = self.vehicle.counters.troubles();
         for (kind, cause) in self.config.doubtful_units() {
@@ -52,7 +53,7 @@ impl NodeBuilder {
         }
     }
 
-    /// Tells the parts of settings that are others than `before`.
+    /// Sends the parts the settings that differ from `before`.
     fn configure_parts(&self, before: &NodeConfig) {
         let (config, slots) = (&self.config, self.slots());
         self.reputations.set_by_evidence(rates_by_evidence(config));
@@ -67,7 +68,7 @@ impl NodeBuilder {
             slots
                 .fuser
                 .send(FuserMessage::Configure { fusion, landmarks });
-            // A part that was switched on starts with the evidence that there is.
+            // A part that was switched on starts with the available evidence.
             let ledger = Arc::new(self.reputations.open().ledger.clone());
             slots.fuser.send(FuserMessage::Adopt { ledger });
         }

@@ -1,4 +1,4 @@
-//! Parts with an address, broker and membership: they come back at the one that they had.
+//! Parts with an address (broker and membership), which are restarted at their former address.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,13 +18,14 @@ use crate::platform::clock;
 use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
 use crate::transport::gossip::BindError;
 
-/// Number of attempts, and time between them, by which a broker or membership started anew gets its address back.
+/// Number of attempts, and time between them, for a restarted broker or membership to bind its
+/// former address.
 const REBIND_ATTEMPTS: usize = 40;
 const REBIND_WAIT: Duration = Duration::from_millis(50);
 
 impl NodeBuilder {
-    /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
-    /// leave it.
+    /// Restarts the broker at its former address, so that the links find it; the previous run may
+    /// need a moment to release the address.
     pub(super) async fn start_broker(
         &self,
         supervisor: ActorCell,
@@ -60,8 +61,8 @@ impl NodeBuilder {
         Ok(id)
     }
 
-    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold
-    /// the node's file descriptors.
+    /// The broker with its connection gate. The gate is also used if only this machine can reach
+    /// the broker, because silent connections would hold the node's file descriptors.
     fn embedded_broker(&self) -> EmbeddedBroker {
         let (config, listen) = (self.config.broker(), self.config.broker_listen());
         let credentials = self.security.credentials.clone();
@@ -98,7 +99,7 @@ impl NodeBuilder {
         EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
     }
 
-    /// The membership comes back at the address it had, as the broker does.
+    /// Restarts the membership at its former address, like the broker.
     pub(super) async fn start_membership(
         &self,
         supervisor: ActorCell,
@@ -130,7 +131,7 @@ impl NodeBuilder {
     }
 }
 
-/// The rule of the node's own broker: who may publish for all.
+/// The rule of the node's own broker: which nodes may publish for the whole cell.
 fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
     let filter = Mutex::<PublisherFilter>::default();
     Arc::new(move |name| {

@@ -35,7 +35,7 @@ impl NodeBuilder {
         })
     }
 
-    /// Tells the uplink of the place and description of the cell.
+    /// Sends the place and description of the cell to the uplink.
     pub(super) fn configure_uplink(&self) {
         let (origin, description) = (self.config.origin, self.held.description.clone());
         self.slots().uplink.send(UplinkMessage::Configure {

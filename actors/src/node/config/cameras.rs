@@ -1,4 +1,4 @@
-//! The cameras of a vehicle: `[camera]`, and further ones in `[[cameras]]`.
+//! The cameras of a vehicle: `[camera]`, and further cameras in `[[cameras]]`.
 
 #[cfg(feature = "camera")]
 use ecod::admission::report_window::MAX_PARTS;
@@ -14,7 +14,7 @@ use crate::camera::config::CameraConfig;
 use crate::camera::detect::DetectorConfig;
 
 impl NodeConfig {
-    /// Gives further cameras the defaults that depend on their detector, but for keys that are stated.
+    /// Gives further cameras the defaults that depend on their detector, except for stated keys.
     #[cfg(feature = "camera")]
     pub(super) fn set_camera_defaults(&mut self, stated: &Figment) {
         let stated = stated
@@ -30,7 +30,7 @@ impl NodeConfig {
         }
     }
 
-    /// Cameras need names by which they are told apart.
+    /// Checks that cameras have distinct names.
     #[cfg(feature = "camera")]
     pub(super) fn validate_cameras(&self) -> Result<(), ConfigError> {
         if let Some(camera) = &self.camera {
@@ -77,7 +77,7 @@ impl NodeConfig {
         self.camera.iter().chain(&self.cameras)
     }
 
-    /// True if the node sees for itself.
+    /// True if the node has a camera of its own.
     pub fn has_camera(&self) -> bool {
         #[cfg(feature = "camera")]
         let has_camera = self.all_cameras().next().is_some();

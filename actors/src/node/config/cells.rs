@@ -1,4 +1,5 @@
-//! The file of cells between which a vehicle moves by its position, and its configuration in each of them.
+//! The file of cells between which a vehicle moves by its position, and its configuration in each
+//! of them.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,15 +18,15 @@ use crate::transport::gossip::check_key;
 use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::Credentials;
 
-/// A file of cells, the same for all vehicles.
+/// A file of cells, common to all vehicles.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CellsFile {
-    /// The cells. That of the vehicle's own configuration is among them.
+    /// The cells, including the cell of the vehicle's own configuration.
     cells: Vec<CellEntry>,
 }
 
-/// A cell, and how a vehicle takes part in it. Paths are relative to the file.
+/// A cell, and the settings with which a vehicle joins it. Paths are relative to the file.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellEntry {
@@ -35,22 +36,23 @@ pub struct CellEntry {
     pub latitude_deg: f64,
     /// Longitude of its middle in degrees, east positive.
     pub longitude_deg: f64,
-    /// Distance in metres from the middle up to which it reaches. Default 300.
+    /// Radius of the cell in metres. Default 300.
     #[serde(default = "default_radius_m")]
     pub radius_m: f64,
     /// Nodes of the cell as `host:port`, as `membership.seeds`.
     #[serde(default)]
     pub seeds: Vec<String>,
-    /// The file with the cell's key. Default that of the own configuration.
+    /// The file with the cell's key. Default: the file of the own configuration.
     #[serde(default)]
     pub key_file: Option<PathBuf>,
-    /// With `[tls]`, the certificate of the cell's CA. Default that of the own configuration.
+    /// With `[tls]`, the certificate of the cell's CA. Default: the CA of the own configuration.
     #[serde(default)]
     pub ca: Option<PathBuf>,
-    /// The revocation list of that CA. Default none.
+    /// The revocation list of that CA. Default: not set.
     #[serde(default)]
     pub revocation_list: Option<PathBuf>,
-    /// The cell's MQTT broker, as `mqtt.broker`; one that wants no login. Default none: its nodes have their own.
+    /// The cell's MQTT broker, as `mqtt.broker`; it must not require a login. Default: not set; the
+    /// cell's nodes have their own brokers.
     #[serde(default)]
     pub broker: Option<BrokerAddress>,
 }
@@ -97,10 +99,10 @@ impl CellEntry {
 }
 
 impl NodeConfig {
-    /// The cells between which the vehicle moves; none if it stays in its own.
+    /// The cells between which the vehicle moves; empty if it stays in its own cell.
     ///
     /// # Errors
-    /// [`LoadError`] naming the file, and the entry and key in it.
+    /// Returns a [`LoadError`] that names the file, and the entry and key in it.
     pub fn load_cells(&self) -> Result<Vec<CellEntry>, LoadError> {
         let Some(path) = &self.cells else {
             return Ok(Vec::new());
@@ -147,10 +149,10 @@ impl NodeConfig {
         Ok(cells)
     }
 
-    /// The credentials with which the vehicle takes part in a cell; none without certificates.
+    /// The credentials with which the vehicle joins a cell; `None` without certificates.
     ///
     /// # Errors
-    /// The cell, and what cannot be used there.
+    /// Returns an error that names the cell and the unusable setting.
     pub fn credentials_in(&self, cell: &CellEntry) -> Result<Option<Arc<Credentials>>, LoadError> {
         let unusable = |error: &dyn std::fmt::Display| {
             LoadError::Malformed(format!("cell {}: {error}", cell.name))
@@ -170,11 +172,12 @@ impl NodeConfig {
         self.pose.listen.is_some() && (self.has_camera() || self.cells.is_some())
     }
 
-    /// The configuration of the vehicle in a cell: its own one at home. Elsewhere it is a guest, which never leads, and takes
-    /// what the cell's nodes share from the cell's description.
+    /// The configuration of the vehicle in a cell: its own configuration in its home cell.
+    /// Elsewhere it is a guest, which cannot lead and takes the shared settings from the cell's
+    /// description.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key that cannot be used there.
+    /// Returns a [`ConfigError`] that names the key that cannot be used there.
     pub fn in_cell(&self, cell: &CellEntry) -> Result<Self, ConfigError> {
         if cell.name == self.cell {
             return Ok(self.clone());
@@ -187,7 +190,7 @@ impl NodeConfig {
         SharedConfig::default().put_into(&mut guest);
         (guest.stated, guest.description) = (StatedKeys::default(), None);
         guest.mqtt.broker.clone_from(&cell.broker);
-        // They are for the own cell's broker.
+        // These settings are for the home cell's broker.
         (guest.mqtt.user, guest.mqtt.password, guest.mqtt.ca) = (None, None, None);
         guest.membership.seeds.clone_from(&cell.seeds);
         guest.membership.advertise = None;

@@ -1,4 +1,4 @@
-//! From what was read of all sources to a configuration, or to words about what is wrong with it.
+//! Converts the values read from all sources to a configuration, or to an error message.
 
 use figment::Figment;
 use figment::providers::{Env, Serialized};
@@ -8,16 +8,16 @@ use super::{LoadError, NodeConfig};
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
 
-/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the address of a node, not
-/// the table of the same name.
+/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the
+/// address of a node, not the table of the same name.
 pub(super) fn environment() -> Env {
     Env::prefixed(ENVIRONMENT_PREFIX)
         .ignore(&["broker"])
         .split("__")
 }
 
-/// Reads the configuration. Values from the environment are guessed to be numbers, lists and so on by their looks;
-/// where a key does not want what was guessed, the value is taken as the text that it is.
+/// Reads the configuration. The type of a value from the environment (number, list and so on) is
+/// guessed from its text; if a key does not accept the guessed type, the value is used as text.
 pub(super) fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
     let mut as_guessed: Option<figment::Error> = None;
     loop {
@@ -29,7 +29,7 @@ pub(super) fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
             errors.path.push(key);
             errors.metadata = figment.find_metadata(&errors.path.join(".")).cloned();
         }
-        // Wrong as text too: the first error is the one to tell of.
+        // Also wrong as text: the first error is reported.
         if let Some(first) = as_guessed.take_if(|first| first.path == errors.path) {
             return Err(LoadError::Malformed(describe(first)));
         }
@@ -41,7 +41,7 @@ pub(super) fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
     }
 }
 
-/// The key and the text of a value from the environment that was taken for something else than text.
+/// The key and the text of a value from the environment that was not interpreted as text.
 fn guessed_wrong(figment: &Figment, error: &figment::Error) -> Option<(String, String)> {
     let key = error.path.join(".");
     if !from_environment(error) || figment.find_value(&key).ok()?.as_str().is_some() {
@@ -58,7 +58,7 @@ fn from_environment(error: &figment::Error) -> bool {
         .is_some_and(|metadata| metadata.name.contains("environment variable"))
 }
 
-/// Keys whose values are shown to nobody.
+/// Keys whose values are never shown.
 const SECRETS: [&str; 4] = ["password", "key", "token", "url"];
 
 /// Every error with its key and where it was read, and without any secret.
@@ -106,8 +106,8 @@ fn describe(errors: figment::Error) -> String {
         .join("\n")
 }
 
-/// The key that is wrong in a table that its `kind` tells apart: serde reads such a table from a buffer and forgets
-/// where it was. It is the one without which the error is another.
+/// The wrong key in a table that is selected by its `kind`: serde reads such a table from a buffer
+/// and loses the position. It is the key without which the error changes.
 fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
     if matches!(error.kind, figment::error::Kind::MissingField(_)) {
         return None;
@@ -136,7 +136,7 @@ fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
     keys.into_keys().filter(|key| key != "kind").find(is_wrong)
 }
 
-/// Errors in the syntax of TOML quote the line that they are about.
+/// Errors in the syntax of TOML quote the affected line.
 fn without_secrets(text: &str) -> String {
     let hide = |line: &str, secret: &str| match line.split_once(secret) {
         Some((before, after)) if after.contains('=') => format!("{before}{secret} = ***"),

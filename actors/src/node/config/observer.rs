@@ -1,4 +1,4 @@
-//! Configurations of observers: nodes that only look on.
+//! Configurations of observers: nodes that only receive.
 
 use ecod::model::names::{InvalidName, NodeName};
 use ecod::wire::Role;
@@ -7,10 +7,11 @@ use super::NodeConfig;
 use crate::transport::pki::OBSERVER_MARK;
 
 impl NodeConfig {
-    /// The configuration of an observer beside the node, for some purpose: it never leads, has no camera and keeps nothing.
+    /// The configuration of an observer that runs in addition to the node, for some purpose: it
+    /// cannot lead, has no camera and keeps no state.
     ///
     /// # Errors
-    /// When its name, that of the node and the purpose, would be too long.
+    /// Returns an error if its name, made of the node's name and the purpose, would be too long.
     pub fn observing(self, purpose: &str) -> Result<Self, InvalidName> {
         let own = format!("{purpose}-{}", std::process::id());
         let holder = self.name.as_ref().filter(|_| self.tls.is_some());
@@ -28,7 +29,8 @@ impl NodeConfig {
         Ok(observer.without_own_addresses())
     }
 
-    /// The configuration without camera, poses, state, page and door, and without the addresses that are the node's.
+    /// The configuration without camera, poses, state, page and local broker, and without the
+    /// node's own addresses.
     pub(crate) fn without_own_addresses(mut self) -> Self {
         if let Some(bind) = &mut self.membership.bind {
             bind.set_port(0);
@@ -44,7 +46,8 @@ impl NodeConfig {
         self
     }
 
-    /// True if the node only looks on: it neither leads nor reports, nor do programs by its door.
+    /// True if the node only observes: it does not lead or report, and does not accept reports of
+    /// local programs.
     pub fn looks_on(&self) -> bool {
         !self.may_lead() && !self.has_camera() && !self.broker.door
     }

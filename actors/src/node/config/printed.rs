@@ -7,19 +7,20 @@ use toml::{Table, Value};
 use super::NodeConfig;
 
 impl NodeConfig {
-    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
+    /// The configuration as TOML that can be read back. Secrets are left out, and a comment marks
+    /// each.
     ///
     /// # Errors
-    /// When a value has no form in TOML.
+    /// Returns an error if a value has no form in TOML.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
         let (shown, comment) = self.without_secrets();
         Ok(comment + &toml::to_string(&shown)?)
     }
 
-    /// The same, with those keys alone whose values differ from the defaults.
+    /// The configuration as TOML, reduced to keys whose values differ from the defaults.
     ///
     /// # Errors
-    /// When a value has no form in TOML.
+    /// Returns an error if a value has no form in TOML.
     pub fn to_toml_changed(&self) -> Result<String, toml::ser::Error> {
         let (shown, comment) = self.without_secrets();
         let mut keys = Table::try_from(&shown)?;

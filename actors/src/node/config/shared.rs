@@ -1,4 +1,5 @@
-//! Settings that all nodes of a cell share: those of the cell's description, and their place in a node's configuration.
+//! Settings that all nodes of a cell share: the settings in the cell's description, and their place
+//! in a node's configuration.
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
@@ -14,15 +15,15 @@ use serde_json::{Map, Value};
 
 use super::NodeConfig;
 
-/// The settings of a description. Keys are those of a node's configuration.
+/// The settings of a description. The keys are keys of a node's configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SharedConfig {
     /// Settings of fusion.
     pub fusion: FusionConfig,
-    /// The known locations.
+    /// The landmarks.
     pub landmarks: Vec<LandmarkConfig>,
-    /// The place of the cell's frame on Earth. Default none.
+    /// The place of the cell's frame on Earth. Default: not set.
     pub origin: Option<GeographicOrigin>,
     /// Settings of all cameras.
     pub camera: SharedCamera,
@@ -47,7 +48,7 @@ pub struct SharedProjection {
 /// Cost of a description for each link of the cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DescriptionCost {
-    /// Size of a map in JSON, in bytes, with a label and three vehicles at each known location.
+    /// Size of a map in JSON, in bytes, with a label and three vehicles at each landmark.
     pub map_bytes: usize,
     /// Bytes of maps a second.
     pub bytes_per_s: f64,
@@ -62,7 +63,8 @@ const MAX_DESCRIBED_BYTES_PER_S: f64 = 4e6;
 /// Round periods in seconds that a description may set.
 const DESCRIBED_PERIODS_S: std::ops::RangeInclusive<f64> = 0.02..=2.0;
 
-/// Names of ordinary length, and the number of vehicles at each location, by which the cost is computed.
+/// Names of ordinary length, and the number of vehicles at each location, by which the cost is
+/// computed.
 const COST_NODE: NodeName = NodeName::from_static("vehicle1");
 const COST_LABEL: Label = Label::new_static("ABCD1234");
 const COST_CONTRIBUTORS: usize = 3;
@@ -70,19 +72,19 @@ const COST_CONTRIBUTORS: usize = 3;
 /// A description that a node cannot use.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DescriptionError {
-    /// It is no TOML, or has unknown keys or values of the wrong kind.
+    /// It is not TOML, or has unknown keys or values of the wrong kind.
     #[error("the description cannot be read: {0}")]
     Malformed(String),
     /// A value is out of its range.
     #[error("in the description, {0}")]
     OutOfRange(ConfigError),
-    /// The node's own configuration says something else.
+    /// The node's own configuration has a different value.
     #[error(
         "configuration key `{key}`: this node's own configuration says {own}, the description of the cell says \
          {described}; remove the key from the node's configuration, or change the description by `ecod-node cell set`"
     )]
     Contradicts {
-        /// The key.
+        /// Configuration key.
         key: String,
         /// The node's own value.
         own: String,
@@ -91,15 +93,17 @@ pub enum DescriptionError {
     },
 }
 
-// Not by thiserror, which would also make it the source: it would be told twice.
+// Implemented by hand because thiserror would also make it the source, and it would be printed
+// twice.
 impl From<ConfigError> for DescriptionError {
     fn from(error: ConfigError) -> Self {
         Self::OutOfRange(error)
     }
 }
 
-/// Shared keys that a node's own configuration states, by file, environment or flags. They are no part of a
-/// configuration's value: two configurations may be equal and state their values in different places.
+/// Shared keys that a node's own configuration states, by file, environment or flags. They are not
+/// part of a configuration's value: two configurations may be equal and state their values in
+/// different places.
 #[derive(Debug, Clone, Default)]
 pub struct StatedKeys(Value);
 
@@ -110,7 +114,7 @@ impl PartialEq for StatedKeys {
 }
 
 impl StatedKeys {
-    /// The shared ones of all keys that are stated.
+    /// The shared keys among all stated keys.
     pub(super) fn of(stated: &Value) -> Self {
         let mut shared = Map::new();
         for key in ["fusion", "landmarks", "origin"] {
@@ -130,7 +134,8 @@ impl SharedConfig {
     /// Reads the text of a description and checks every value.
     ///
     /// # Errors
-    /// [`DescriptionError`] naming the line, or the key, the value and what is allowed.
+    /// Returns a [`DescriptionError`] that names the line, or the key, the value and the allowed
+    /// range.
     pub fn parse(text: &str) -> Result<Self, DescriptionError> {
         let shared: Self =
             toml::from_str(text).map_err(|error| DescriptionError::Malformed(error.to_string()))?;
@@ -152,7 +157,7 @@ impl SharedConfig {
         Ok(shared)
     }
 
-    /// What maps of the known locations cost each link, once vehicles report there.
+    /// The cost of maps of the landmarks for each link, once vehicles report there.
     pub fn cost(&self) -> DescriptionCost {
         let epoch = Epoch::new(1, COST_NODE);
         let occupied = |location: &LandmarkConfig| LandmarkState {
@@ -177,8 +182,8 @@ impl SharedConfig {
         }
     }
 
-    /// Checks that every link carries a map in the time of a round, and that rounds come often enough for followers to
-    /// notice a silent leader.
+    /// Checks that every link carries a map in the time of a round, and that rounds come often
+    /// enough for followers to notice a silent leader.
     fn check_cost(&self) -> Result<(), DescriptionError> {
         let period_s = self.fusion.round.period_s;
         if !DESCRIBED_PERIODS_S.contains(&period_s) {
@@ -256,7 +261,7 @@ impl NodeConfig {
     /// The configuration with the values of a cell's description.
     ///
     /// # Errors
-    /// [`DescriptionError`], also where the node's own configuration states another value.
+    /// Returns a [`DescriptionError`], also if the node's own configuration states another value.
     pub fn described(&self, text: &str) -> Result<Self, DescriptionError> {
         let malformed =
             |error: &dyn std::fmt::Display| DescriptionError::Malformed(error.to_string());
@@ -291,7 +296,7 @@ impl NodeConfig {
     }
 }
 
-/// Paths of all values that are no tables.
+/// Paths of all values that are not tables.
 fn leaves(value: &Value) -> Vec<Vec<String>> {
     let Value::Object(table) = value else {
         return vec![Vec::new()];
@@ -321,7 +326,8 @@ fn put(value: &mut Value, path: &[String], leaf: Value) {
     }
 }
 
-/// Where two values first differ, with both as text: a place in a list, or the whole.
+/// The first difference between two values, with both as text: a place in a list, or the whole
+/// value.
 fn difference(own: &Value, described: &Value) -> Option<(String, String, String)> {
     match (own, described) {
         _ if own == described => None,
@@ -415,7 +421,7 @@ mod tests {
     #[test]
     fn a_contradiction_names_the_key_and_both_values() {
         for (toml, parts) in [
-            // The default, and yet stated.
+            // Equal to the default, but explicitly stated.
             (
                 "[fusion.pace]\ngate_m = 0.5",
                 ["`fusion.pace.gate_m`", "0.5", "1.0"],

@@ -1,4 +1,4 @@
-//! Values that are allowed, and yet look as if they were in another unit.
+//! Values that are allowed but look as if they were in another unit.
 
 use std::borrow::Cow;
 use std::f64::consts::{FRAC_PI_4, TAU};
@@ -28,11 +28,11 @@ const MIN_FIELD_OF_VIEW_DEG: f64 = 4.0;
 /// Greatest standard deviation of an angle in radians; degrees are above.
 const MAX_ANGLE_SIGMA_RAD: f64 = 0.5;
 
-/// Distance from a multiple of 45° in radians within which a value looks like one that was rounded.
+/// Distance from a multiple of 45° in radians within which a value looks like a rounded one.
 const ROUNDING_RAD: f64 = 0.003;
 
 impl NodeConfig {
-    /// The kinds of trouble about units; where there is one, its cause with key, value and unit.
+    /// The kinds of trouble about units; for a doubtful value, its cause with key, value and unit.
     pub fn doubtful_units(&self) -> [(TroubleKind, Option<String>); 2] {
         let mut found = Vec::new();
         if let Ok(keys) = Value::try_from(self) {
@@ -55,7 +55,7 @@ impl NodeConfig {
     }
 }
 
-/// Adds the paths of doubtful numbers, each with its value and unit in words.
+/// Adds the paths of doubtful numbers, each with its value and unit as text.
 fn collect(value: &Value, path: &str, found: &mut Vec<(String, String)>) {
     let number = match value {
         Value::Table(table) => {
@@ -88,7 +88,7 @@ fn as_only_camera(path: &str) -> Cow<'_, str> {
     key.map_or(path.into(), |key| format!("camera.{key}").into())
 }
 
-/// The unit that a value should have, if it looks like one in another.
+/// The unit that a value should have, if it looks like a value in another unit.
 fn missed_unit(path: &str, value: f64) -> Option<&'static str> {
     let (table, key) = path.rsplit_once('.').unwrap_or(("", path));
     let size = value.abs();
@@ -126,7 +126,7 @@ fn is_multiple_of_45_deg_in_radians(value: f64) -> bool {
     (1.0..=8.0).contains(&eighths.abs()) && (value - eighths * FRAC_PI_4).abs() < ROUNDING_RAD
 }
 
-/// True if a listed size is far from the usual one of its label.
+/// True if a listed size is far from the usual size of its label.
 fn is_unusual(table: &str, key: &str, value: f64) -> bool {
     let Some(label) = table
         .strip_prefix(SIZES)

@@ -56,7 +56,7 @@ pub fn page_file(path: &str) -> Option<(&'static str, &'static str)> {
 /// Style sheet of map and timeline, with the colours of all pages.
 pub(crate) const VIEW_STYLE: &str = include_str!("page/view.css");
 
-/// Map and timeline of the page in HTML, with the identities that the scripts know.
+/// Map and timeline of the page in HTML, with the element ids that the scripts use.
 pub(crate) fn view() -> &'static str {
     let page = include_str!("page/index.html")
         .split("<!-- map and timeline, also of reports -->")
@@ -65,7 +65,8 @@ pub(crate) fn view() -> &'static str {
         .unwrap_or_default()
 }
 
-/// The scripts that draw map and timeline, as one script without imports. No two of them have a name of their own alike.
+/// The scripts that draw map and timeline, as one script without imports. Their top-level names
+/// must be distinct.
 pub(crate) fn view_script() -> String {
     const PATHS: [&str; 10] = [
         "/dom.js",

@@ -28,7 +28,8 @@ impl CameraFeed {
         self.pictures.receiver_count()
     }
 
-    /// True if the frame captured at this time is to be shown: a browser waits, and the last picture is old enough.
+    /// True if the frame captured at this time should be shown: a browser waits, and the last
+    /// picture is old enough.
     pub fn takes(&self, captured_at: Timestamp) -> bool {
         let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
         let takes = self.viewers() > 0 && captured_at >= *due;

@@ -1,4 +1,4 @@
-//! A camera's picture for browsers: a JPEG with boxes, and where each detection was placed.
+//! A camera's picture for browsers: a JPEG with boxes, and the place of each detection.
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use bytes::Bytes;
@@ -22,7 +22,7 @@ pub struct PictureBox {
     confidence: f64,
     /// Left, upper, right and lower edge, as shares of the picture's width and height.
     edges: [f64; 4],
-    /// The object in the node's report; none where the detection has no place.
+    /// The object in the node's report; `None` if the detection has no place.
     pub object: Option<PerceivedObject>,
 }
 
@@ -63,7 +63,7 @@ impl PictureBox {
 /// The picture as a server-sent event named `camera`.
 ///
 /// # Errors
-/// [`ImageError`] of the JPEG.
+/// Returns an [`ImageError`] of the JPEG encoder.
 pub fn camera_event(frame: &CameraFrame, boxes: &[PictureBox]) -> Result<Bytes, ImageError> {
     let jpeg = BASE64_STANDARD.encode(jpeg(&frame.image)?);
     let ImageSize {

@@ -12,23 +12,26 @@ use crate::platform::secret::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DashboardConfig {
-    /// True if page, metrics and health are served. Default true.
+    /// Whether page, metrics and health are served. Default true.
     pub enabled: bool,
-    /// Address and port of the page; port 0 takes a free one, which the log names. Default [`DEFAULT_ADDRESS`], or a
-    /// free port if that is in use. An address that other machines reach needs a token.
+    /// Address and port of the page; port 0 takes a free one, which the log names. Default
+    /// [`DEFAULT_ADDRESS`], or a free port if that is in use. An address that other machines can
+    /// reach needs a token.
     pub listen: Option<SocketAddr>,
-    /// Secret that gives access, at least 12 characters that an address need not escape. Default none, which only a
-    /// loopback address allows. Prefer `ECOD_DASHBOARD__TOKEN` to a file that others can read.
+    /// Secret that gives access, at least 12 characters that need no escaping in an address.
+    /// Default: not set, which only a loopback address allows. Prefer `ECOD_DASHBOARD__TOKEN` to a
+    /// file that other users can read.
     pub token: Option<Secret>,
-    /// True if the page shows the pictures of the node's camera to those who may look. Default true.
+    /// Whether the page shows the pictures of the node's camera to users with access. Default true.
     pub camera: bool,
-    /// Image under the map. Default none.
+    /// Image under the map. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub floor_plan: Option<FloorPlanConfig>,
-    /// Maximum snapshots a second for each browser. Default 10. Trade-off: more show a fast cell better, fewer cost less.
+    /// Maximum snapshots per second for each browser. Default 10. Trade-off: more snapshots show a
+    /// fast cell better, fewer cost less.
     pub max_rate_hz: f64,
-    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others briefly; at most
-    /// half of them carry live snapshots.
+    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others
+    /// briefly; at most half of them carry live snapshots.
     pub max_connections: usize,
 }
 
@@ -57,10 +60,10 @@ impl Default for DashboardConfig {
 }
 
 impl DashboardConfig {
-    /// Checks every value, and that an address that others reach has a token.
+    /// Checks every value, and that an address that other machines can reach has a token.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_rate_hz", self.max_rate_hz, 0.1, 60.0)?;
         check_range("max_connections", self.max_connections as f64, 4.0, 4096.0)?;
@@ -99,10 +102,10 @@ impl DashboardConfig {
         }
     }
 
-    /// The floor plan, read, if a page is to show one.
+    /// Reads the floor plan, if the page shows one.
     ///
     /// # Errors
-    /// [`ConfigError`] as of [`FloorPlanConfig::load`].
+    /// Returns the errors of [`FloorPlanConfig::load`].
     pub fn load_floor_plan(&self) -> Result<Option<FloorPlan>, ConfigError> {
         let plan = self.floor_plan.as_ref().filter(|_| self.enabled);
         plan.map(FloorPlanConfig::load)

@@ -1,4 +1,4 @@
-//! Floor plan under the map: an image file, placed by two points of known position.
+//! Floor plan under the map: an image file, placed by two points with given positions.
 
 use std::path::PathBuf;
 
@@ -16,11 +16,11 @@ use crate::platform::bounded_file;
 pub struct FloorPlanConfig {
     /// PNG, JPEG or WebP file, 8 MiB at most.
     pub image: PathBuf,
-    /// Two points that give scale, direction and place. They are best far apart.
+    /// Two points that determine scale, direction and place. They should be far apart.
     pub points: [FloorPlanPoint; 2],
 }
 
-/// A point of the image whose position is known.
+/// A point of the image with a given position.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FloorPlanPoint {
@@ -30,7 +30,7 @@ pub struct FloorPlanPoint {
     pub position_m: [f64; 2],
 }
 
-/// A floor plan that was read.
+/// A floor plan that has been read.
 #[derive(Debug, Clone)]
 pub struct FloorPlan {
     pub(crate) content_type: &'static str,
@@ -43,7 +43,8 @@ pub struct FloorPlan {
 pub struct FloorPlanFacts {
     /// Path of the image.
     path: &'static str,
-    /// The map `[a, b, c, d, e, f]` from pixels to metres: east is a·column + c·row + e, north is b·column + d·row + f.
+    /// The map `[a, b, c, d, e, f]` from pixels to metres: east is a·column + c·row + e, north is
+    /// b·column + d·row + f.
     metres: [f64; 6],
 }
 
@@ -57,10 +58,10 @@ const MAX_BYTES: u64 = 8 * 1024 * 1024;
 const MAX_COORDINATE: f64 = 1e6;
 
 impl FloorPlanConfig {
-    /// Checks the points, not the file.
+    /// Checks the points, but not the file.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for (index, point) in self.points.iter().enumerate() {
             for (key, value) in [("pixel", point.pixel), ("position_m", point.position_m)] {
@@ -97,7 +98,8 @@ impl FloorPlanConfig {
     /// Reads the image.
     ///
     /// # Errors
-    /// [`ConfigError`] when the file cannot be read, is too large or no image, or a point lies outside of it.
+    /// Returns a [`ConfigError`] if the file cannot be read, is too large or not an image, or a
+    /// point lies outside of it.
     pub fn load(&self) -> Result<FloorPlan, ConfigError> {
         let refuse = |found: String| {
             let allowed = format!(
@@ -148,7 +150,8 @@ impl FloorPlanConfig {
         })
     }
 
-    /// The similarity through both points. With rows counted upwards it is the complex function m = s·p + t.
+    /// The similarity through both points. With rows counted upwards it is the complex function m =
+    /// s·p + t.
     fn metres(&self) -> [f64; 6] {
         let [(p1, m1), (p2, m2)] = self.points.map(|FloorPlanPoint { pixel, position_m }| {
             (

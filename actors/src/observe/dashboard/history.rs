@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::snapshot::json;
 use super::timeline::Timeline;
 
-/// One leader's time in the lead, as this node saw it.
+/// One leader's time in the lead, as observed by this node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct LeaderTerm {
     /// The leader.
@@ -24,7 +24,8 @@ pub(crate) struct LeaderTerm {
     pub from_us: Timestamp,
     /// Time at which this node stopped; absent while it follows.
     pub until_us: Option<Timestamp>,
-    /// Milliseconds between the last round accepted before and this leader's first; absent until both are known.
+    /// Milliseconds between the last accepted round before this term and this leader's first round;
+    /// absent until both have arrived.
     pub gap_ms: Option<u64>,
 }
 
@@ -35,7 +36,8 @@ struct VitalsSample<'a> {
     at_us: Timestamp,
     /// Rounds accepted.
     rounds: u32,
-    /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a map.
+    /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a
+    /// map.
     latency_p50_ms: Option<f64>,
     /// Maximum of the same.
     latency_max_ms: Option<f64>,
@@ -55,7 +57,8 @@ pub(crate) struct History {
     /// Changes of the leader since the node started.
     pub failovers: u64,
     last_round: Option<(Epoch, Timestamp)>,
-    /// Gap before the last epoch's first round. The round may arrive before the election names the leader.
+    /// Gap before the last epoch's first round. The round may arrive before the election names the
+    /// leader.
     last_gap: Option<(Epoch, u64)>,
     latencies_ms: Vec<f64>,
     rounds: u32,
@@ -163,7 +166,8 @@ impl History {
         );
     }
 
-    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
+    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's
+    /// clock.
     pub(crate) fn add_round(
         &mut self,
         epoch: &Epoch,

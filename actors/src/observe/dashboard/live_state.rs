@@ -17,11 +17,12 @@ use serde::Serialize;
 
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 
-/// Latest report and status of each node. The links' tasks write, the dashboard reads; neither waits for the other.
+/// Latest report and status of each node. The links' tasks write and the dashboard reads; the two
+/// do not wait for each other.
 #[derive(Debug, Default)]
 pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
-    /// True where browsers want reports, and where programs do.
+    /// True if browsers want reports, and if local programs do.
     wants_reports: [AtomicBool; 2],
     latest: Mutex<Latest>,
 }
@@ -37,7 +38,7 @@ struct Latest {
 pub(crate) struct ReportedStatus {
     /// The status, or the node's last will.
     pub status: Arc<NodeStatus>,
-    /// Brokers that passed it on and whose links still hold.
+    /// Brokers that forwarded it and whose links are still up.
     pub via: BTreeSet<BrokerAddress>,
     at: Timestamp,
 }
@@ -54,22 +55,24 @@ pub struct LatestReport {
     pub report: Arc<ObjectReport>,
 }
 
-/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes. Of
-/// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
+/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or
+/// long silent nodes. Of the parts of one node [`MAX_PARTS`] are kept: further ones replace parts
+/// of the same node.
 pub const MAX_SHOWN: usize = 256;
 
-/// Maximum number of troubles that are shown, and of those that one member other than the leader may report, with its parts.
+/// Maximum number of troubles that are shown, and number of troubles that one member other than the
+/// leader may report, including its parts.
 const MAX_SHOWN_TROUBLES: usize = 64;
 const MAX_TROUBLES_OF_ONE: usize = 4;
 
-/// Maximum length of a member's words on the page, in characters.
+/// Maximum length of a member's text on the page, in characters.
 const MAX_QUOTED_CHARACTERS: usize = 120;
 
 /// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
 
 impl LiveState {
-    /// Takes a message that this node received or published.
+    /// Processes a message that this node received or published.
     pub fn update(&self, message: &Incoming, received_at: Timestamp) {
         let mut latest = self.latest();
         match message {
@@ -155,7 +158,7 @@ impl LiveState {
         self.wants_reports[0].store(wanted, Relaxed);
     }
 
-    /// Notes whether programs beside the node want reports.
+    /// Records whether local programs want reports.
     pub fn set_programs_want_reports(&self, wanted: bool) {
         self.wants_reports[1].store(wanted, Relaxed);
     }
@@ -183,10 +186,11 @@ impl LiveState {
         self.latest().statuses.clone()
     }
 
-    /// The present troubles of the cell, each once: first what this node `name` has found, then what the leader reports, then
-    /// what living nodes report of themselves and of hosts and brokers that they do not reach. A vehicle and its parts have
-    /// room for [`MAX_TROUBLES_OF_ONE`] of these, in their words as a quotation and with the remedy that this node has for
-    /// their kind: no member writes advice onto the pages of others.
+    /// The current troubles of the cell, each once: first the troubles that this node `name` has
+    /// found, then the leader's reports, then living nodes' reports about themselves and about
+    /// hosts and brokers that they do not reach. A vehicle with its parts has room for
+    /// [`MAX_TROUBLES_OF_ONE`] of these reports. Their text is shown as a quotation, with this
+    /// node's remedy for the kind, so that a member cannot write advice onto other nodes' pages.
     pub(crate) fn troubles(
         &self,
         name: &NodeName,
@@ -252,7 +256,7 @@ impl LiveState {
     }
 }
 
-/// A member's trouble in its own words, as a quotation, with this node's remedy for the kind.
+/// A member's trouble with its text as a quotation, and this node's remedy for the kind.
 fn quoted(trouble: &Trouble) -> Trouble {
     let remedy =
         TroubleKind::named(&trouble.kind).map_or("see the log of that node", TroubleKind::remedy);
@@ -273,8 +277,9 @@ fn are_parts(one: &NodeName, other: &NodeName) -> bool {
     node != *other && node != *one && one.vehicle() == node
 }
 
-/// Inserts a value. Where there are too many entries beside it, or in all, the one of the least rank is dropped first. A
-/// full map keeps what it has if that one does not give way.
+/// Inserts a value. If there are too many entries in its group or in total, the entry with the
+/// lowest rank is dropped first. If that entry outranks the new one, the full map is left
+/// unchanged.
 fn insert<K: Ord + Clone, T, R: Ord>(
     map: &mut BTreeMap<K, T>,
     (key, value): (K, T),
@@ -607,7 +612,7 @@ mod tests {
         );
     }
 
-    /// A stolen certificate may speak in the names of any number of parts.
+    /// A stolen certificate may be used in the names of any number of parts.
     #[test]
     fn the_parts_of_one_node_leave_room_for_other_nodes() {
         let live_state = LiveState::default();

@@ -8,7 +8,8 @@ const BOUNDS_S: [f64; 12] = [
     0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0,
 ];
 
-/// Latency of maps in two parts and as a whole. All but the first compare the clocks of aggregator and node.
+/// Latency of maps in two parts and as a whole. All but the first compare the clocks of aggregator
+/// and node.
 #[derive(Debug)]
 pub(crate) struct MapLatency {
     /// From the oldest capture in a map, on the aggregator's clock, to its fusion.

@@ -1,7 +1,8 @@
 //! Metrics of the node for Prometheus, in the OpenMetrics text format.
 //!
-//! All values are read on request; only counters that the node has anyway are kept. The number of label values is
-//! bounded: reasons and states are fixed sets, vehicles are the first [`MAX_VEHICLES`] by name.
+//! All values are read on request; only counters that the node has anyway are kept. The number of
+//! label values is bounded: reasons and states are fixed sets, vehicles are the first
+//! [`MAX_VEHICLES`] by name.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -32,7 +33,7 @@ type FloatGauge = Gauge<f64, AtomicU64>;
 /// All metrics as text.
 ///
 /// # Errors
-/// Never for text; the encoder's writer may fail.
+/// Does not fail for text; the encoder's writer may fail.
 pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
     node(&mut registry, monitor);
@@ -109,7 +110,7 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
 
 fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {
     let present = monitor.sources.counters.troubles().present().into_iter();
-    // Not by name: names come from outside, and there is no end of them.
+    // Not by name: names come from outside and are unbounded in number.
     let mut by_kind: BTreeMap<(String, &str), i64> = BTreeMap::new();
     for Trouble { kind, about, .. } in present {
         *by_kind

@@ -10,18 +10,18 @@ use crate::camera::mount_calibration::{
     MeasuredPoint, fit_mount_to_points, mount_table, vehicle_of,
 };
 
-/// Settings of a camera that fitting its mount needs, beside points.
+/// Settings of a camera that fitting its mount needs, in addition to points.
 #[derive(Debug, Clone)]
 pub struct CameraSetup {
     /// Configured optics.
     pub optics: OpticsConfig,
     /// Configured mount, with which the camera's pose is reported.
     pub mount: MountConfig,
-    /// True if the camera is one of `[[cameras]]`.
+    /// True if the camera is an entry of `[[cameras]]`.
     pub is_one_of_several: bool,
 }
 
-/// Points of the ground that were clicked in a picture of the camera and on the map.
+/// Points on the ground that were clicked in a picture of the camera and on the map.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct MountQuestion {
@@ -45,7 +45,7 @@ impl MountQuestion {
     /// The mount of a camera that reports this pose.
     ///
     /// # Errors
-    /// The reason in a sentence, with the remedy.
+    /// Returns the reason in a sentence, with the remedy.
     pub(crate) fn answer(&self, setup: &CameraSetup, camera: &Pose) -> Result<MountAnswer, String> {
         let lens = setup
             .optics

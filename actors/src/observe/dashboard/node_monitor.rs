@@ -36,7 +36,7 @@ pub(crate) struct NodeMonitor {
     event: ResponseCache<Bytes>,
 }
 
-/// Everything that the monitor remembers.
+/// The stored observations of the monitor.
 #[derive(Debug, Default)]
 pub(crate) struct Observed {
     /// Terms of leadership and samples.
@@ -53,14 +53,14 @@ const PROBE_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum time between two snapshots: browsers take a longer silence for a lost connection.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// Time between two looks at what the timeline shows.
+/// Time between two updates of the timeline.
 const LOOK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Frame of a server-sent event around the JSON of a snapshot.
 const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
 const EVENT_END: &[u8] = b"\n\n";
 
-/// Age of a vehicle's last report beyond which the vehicle is no longer shown.
+/// Age of a vehicle's last report from which the vehicle is not shown any more.
 pub(crate) const MAX_REPORT_AGE: Duration = Duration::from_secs(30);
 
 impl NodeMonitor {
@@ -89,7 +89,8 @@ impl NodeMonitor {
         self.sources.vitals.readiness(&self.observed().probe)
     }
 
-    /// The latest snapshot as a server-sent event, taken anew once it expired.
+    /// The latest snapshot as a server-sent event; a new snapshot is taken once the old one has
+    /// expired.
     pub(crate) fn event(&self) -> Bytes {
         self.cached_event().value
     }
@@ -100,7 +101,7 @@ impl NodeMonitor {
         event.slice(EVENT_HEAD.len()..event.len() - EVENT_END.len())
     }
 
-    /// Observes the node; never ends.
+    /// Observes the node; does not return.
     pub(crate) async fn run(&self) {
         tokio::join!(self.follow_changes(), self.poll_probes());
     }
@@ -226,7 +227,7 @@ impl NodeMonitor {
         }
     }
 
-    /// Probes gateway and broker. A part that does not answer delays nothing else.
+    /// Probes gateway and broker. A part that does not answer does not delay other work.
     async fn poll_probes(&self) {
         let mut probes = ticks(PROBE_PERIOD);
         loop {
@@ -304,7 +305,7 @@ impl NodeMonitor {
         );
     }
 
-    /// Adds to the timeline what is news, and the newest map.
+    /// Adds new events and the newest map to the timeline.
     fn extend_timeline(&self) {
         let (sources, now, troubles) = (&self.sources, clock::now(), self.troubles());
         let newest = &sources.vitals.newest;
@@ -353,7 +354,7 @@ impl NodeMonitor {
         }
     }
 
-    /// Has a node that only follows receive the vehicles' reports while a browser shows them.
+    /// Makes a node that only follows receive the vehicles' reports while a browser shows them.
     fn request_reports(&self) {
         let wanted = self.viewers() > 0
             && self.sources.vitals.leadership.borrow().position == Position::Following;

@@ -1,4 +1,4 @@
-//! Inputs of the dashboard. Reading them never makes another part of the node wait.
+//! Inputs of the dashboard. Reading them does not block other parts of the node.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use crate::observe::readiness::Vitals;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::{FrameCounters, Member};
 
-/// Everything that the dashboard reads from its node.
+/// All inputs that the dashboard reads from its node.
 #[derive(Debug, Clone)]
 pub struct NodeSources {
     /// The node.
@@ -64,7 +64,8 @@ pub struct NodeFacts {
     pub role: Role,
     /// True if `/api/camera` shows the pictures of its cameras.
     pub camera: bool,
-    /// Names of these, in their order; none for one without a name, which is the first.
+    /// Names of these cameras, in their order; `None` for the camera without a name, which is the
+    /// first.
     pub cameras: Vec<Option<String>>,
     /// The image under the map, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -78,7 +79,7 @@ pub struct NodeFacts {
 }
 
 impl NodeSources {
-    /// The node as it is now.
+    /// The current facts about the node.
     pub(crate) fn node_facts(&self) -> NodeFacts {
         NodeFacts {
             round_period_s: self.vitals.shared.borrow().round_period_s,
@@ -101,14 +102,14 @@ impl NodeSources {
             .sum()
     }
 
-    /// Known locations of the cell.
+    /// Landmarks of the cell.
     pub(crate) fn landmarks(&self) -> Vec<LandmarkFacts> {
         let landmarks = Arc::clone(&self.vitals.shared.borrow().landmarks);
         landmarks.iter().map(LandmarkFacts::from).collect()
     }
 }
 
-/// A known location.
+/// A landmark.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LandmarkFacts {
     /// Name of the location.

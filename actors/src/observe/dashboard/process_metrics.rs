@@ -11,7 +11,8 @@ use prometheus_client::registry::{Registry, Unit};
 
 use crate::telemetry::line_throttle::lines_left_out;
 
-/// Registers CPU time, memory and time of start, as far as the operating system tells them, and log lines left out.
+/// Registers CPU time, memory and start time, as far as the operating system provides them, and the
+/// number of skipped log lines.
 pub fn register(registry: &mut Registry, started_at: Timestamp) {
     let started = Gauge::<f64, AtomicU64>::default();
     started.set(started_at.micros() as f64 / 1e6);

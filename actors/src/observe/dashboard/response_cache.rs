@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// Keeps a response until it expires. Computing it takes a small share of a core at most, however many clients ask.
+/// Keeps a response until it expires. Computing it takes at most a small share of a core,
+/// independent of the number of clients.
 #[derive(Debug)]
 pub(crate) struct ResponseCache<T> {
     min_age: Duration,
@@ -30,7 +31,7 @@ impl<T: Clone> ResponseCache<T> {
         }
     }
 
-    /// The cached response, or a new one where that has expired.
+    /// The cached response, or a new one if it has expired.
     pub(crate) fn get(&self, compute: impl FnOnce() -> T) -> CachedResponse<T> {
         let mut cached = self.cached.lock().unwrap_or_else(PoisonError::into_inner);
         let begun = Instant::now();

@@ -53,11 +53,11 @@ pub(crate) struct HttpApi {
 /// Minimum age of the metrics before they are read again.
 const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
 
-/// Maximum size of the points of a mount: more than anyone clicks.
+/// Maximum size of the points of a mount: more than a user would click.
 #[cfg(feature = "camera")]
 const MAX_POINTS_BYTES: usize = 16 * 1024;
 
-/// Maximum time for the points of a mount to come.
+/// Maximum time for receiving the points of a mount.
 #[cfg(feature = "camera")]
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -77,7 +77,8 @@ impl HttpApi {
         }
     }
 
-    /// All routes. Health needs no token, as the machines that ask hold no secrets.
+    /// All routes. Health needs no token, because the monitoring systems that query it have no
+    /// secrets.
     pub(crate) fn router(self, access: PageAccess) -> Router {
         let api = Arc::new(self);
         let guarded = Router::new()
@@ -234,7 +235,8 @@ async fn show_camera(State(api): Api, uri: Uri) -> Response {
     }
 }
 
-/// The mount of a camera, from points that were clicked. Foreign pages cannot ask: the content's type must be JSON.
+/// The mount of a camera, from points that were clicked. Other sites' pages cannot send this
+/// request, because the content type must be JSON.
 #[cfg(feature = "camera")]
 async fn answer_mount(State(api): Api, request: Request) -> Response {
     let camera = match api.camera(request.uri()) {

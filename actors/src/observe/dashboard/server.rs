@@ -30,7 +30,7 @@ impl Server {
     /// Starts the thread; `bound` receives the address once the server listens.
     ///
     /// # Errors
-    /// When the operating system gives no thread.
+    /// Returns an error if the operating system gives no thread.
     pub(crate) fn start(
         config: DashboardConfig,
         monitor: Arc<NodeMonitor>,
@@ -83,7 +83,7 @@ async fn serve(
     monitor: &Arc<NodeMonitor>,
     bound: &watch::Sender<Option<SocketAddr>>,
 ) {
-    // Browsers may know the port of an earlier run.
+    // Browsers may use the port of an earlier run.
     let wanted = bound.borrow().or(config.listen);
     let listener = match wanted {
         Some(address) => listen(address, monitor).await,
@@ -103,7 +103,8 @@ async fn serve(
     .await;
 }
 
-/// Listens at the default address or, if another node of the machine does, on a free port of loopback.
+/// Listens at the default address or, if another node of the machine uses it, on a free port of
+/// loopback.
 async fn listen_anywhere(monitor: &NodeMonitor) -> TcpListener {
     match TcpListener::bind(DEFAULT_ADDRESS).await {
         Ok(listener) => listener,

@@ -1,4 +1,4 @@
-//! Everything that the page shows of a cell, as one JSON object.
+//! All data of a cell that the page shows, as one JSON object.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
@@ -23,7 +23,8 @@ pub(crate) type LinkStates = BTreeMap<BrokerAddress, LinkState>;
 /// Version of [`Snapshot`] and of the other answers of the API.
 pub(crate) const API_VERSION: u32 = 1;
 
-/// A node's knowledge of its cell at one moment. Times are Unix microseconds by the node's clock, except in messages.
+/// A node's view of its cell at one moment. Times are Unix microseconds by the node's clock, except
+/// in messages.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Snapshot {
     /// [`API_VERSION`].
@@ -48,7 +49,7 @@ pub(crate) struct Snapshot {
     pub nodes: Vec<NodeEntry>,
     /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
     pub links: BTreeMap<String, String>,
-    /// Present troubles of the cell as this node knows them, its own first.
+    /// Current troubles of the cell on this node, the node's own troubles first.
     pub troubles: Vec<TroubleEntry>,
     /// Counters of failures and losses, by reason.
     pub counters: CounterSnapshot,
@@ -57,7 +58,7 @@ pub(crate) struct Snapshot {
 /// A trouble, for a browser.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct TroubleEntry {
-    /// The node that tells it.
+    /// The node that reports the trouble.
     pub told_by: NodeName,
     /// The trouble.
     #[serde(flatten)]
@@ -71,7 +72,7 @@ pub(crate) struct LeadershipFacts {
     pub position: Position,
     /// The leader; absent while the node seeks one.
     pub leader: Option<NodeName>,
-    /// Highest term known.
+    /// Highest term that has been seen.
     pub epoch: Option<u64>,
     /// The node that leads next.
     pub standby: Option<NodeName>,
@@ -88,15 +89,17 @@ pub(crate) struct NodeEntry {
     pub name: NodeName,
     /// Its role.
     pub role: Role,
-    /// True if it answers. A node that never answered is alive while a linked broker reports its status.
+    /// True if the node answers. A node that has not answered yet counts as alive while a linked
+    /// broker reports its status.
     pub alive: bool,
     /// State that it reported.
     pub state: Option<NodeState>,
-    /// True if it reported that it could lead.
+    /// True if the node reported that it could lead.
     pub fit: Option<bool>,
     /// Version of its software.
     pub version: Option<String>,
-    /// Address and port of its page, where this node's users may reach it. Its own page is left out.
+    /// Address and port of its page, where this node's users may reach it. Its own page is left
+    /// out.
     pub page: Option<SocketAddr>,
 }
 
@@ -109,7 +112,8 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
     text
 }
 
-/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
+/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is
+/// absent if unknown.
 pub(crate) fn nodes(
     sources: &NodeSources,
     met: &BTreeSet<NodeName>,
@@ -141,7 +145,8 @@ pub(crate) fn nodes(
     nodes
 }
 
-/// Members are alive while they answer. Of nodes that never answered, the status from a linked broker counts.
+/// Members are alive while they answer. For nodes that have not answered yet, the status from a
+/// linked broker counts.
 fn others(
     members: &[Member],
     mut statuses: BTreeMap<NodeName, ReportedStatus>,
@@ -186,7 +191,8 @@ fn others(
     nodes
 }
 
-/// Address of the page of a node whose datagrams come from `host`. One on loopback serves its own machine only.
+/// Address of the page of a node whose datagrams come from `host`. One on loopback serves its own
+/// machine only.
 fn page(status: &NodeStatus, host: IpAddr) -> Option<SocketAddr> {
     let page: SocketAddr = status.page.as_ref()?.parse().ok()?;
     match page.ip() {

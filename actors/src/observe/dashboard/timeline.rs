@@ -1,4 +1,4 @@
-//! Events and maps of a cell over time: what page and report scrub through.
+//! Events and maps of a cell over time, for the time slider of page and report.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
@@ -31,7 +31,7 @@ pub(crate) struct TimelineEvent {
     pub at_us: Timestamp,
     /// Its kind.
     pub kind: EventKind,
-    /// The event in words.
+    /// The event as text.
     pub text: String,
 }
 
@@ -39,7 +39,7 @@ pub(crate) struct TimelineEvent {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum EventKind {
-    /// A node came.
+    /// A node joined.
     Joined,
     /// A node left, or does not answer.
     Lost,
@@ -47,11 +47,11 @@ pub(crate) enum EventKind {
     Trouble,
     /// A vehicle is contradicted by the others more often than not.
     Distrusted,
-    /// The log has nothing for a while.
+    /// The log has a gap.
     Gap,
 }
 
-/// A map and what it rests on, with the field names of a [`Snapshot`](super::snapshot::Snapshot).
+/// A map and its inputs, with the field names of a [`Snapshot`](super::snapshot::Snapshot).
 #[derive(Debug, Serialize)]
 pub(crate) struct TimelineFrame {
     /// Time of receipt.
@@ -64,8 +64,8 @@ pub(crate) struct TimelineFrame {
     pub vehicles: Vec<LatestReport>,
 }
 
-/// Texts over time within [`MAX_SERIES_BYTES`]. A full series drops every second item and takes half as many from then
-/// on.
+/// Texts over time within [`MAX_SERIES_BYTES`]. A full series drops every second item and then
+/// accepts half as many.
 #[derive(Debug)]
 pub(crate) struct ThinnedSeries {
     items: VecDeque<(Timestamp, Vec<u8>)>,
@@ -86,11 +86,12 @@ pub(crate) const MAX_SERIES_BYTES: usize = 8 << 20;
 /// Minimum time between two items of a series that was thinned.
 const THINNED_PERIOD: Duration = Duration::from_millis(100);
 
-/// Reputation below which a vehicle is distrusted, and from which it is trusted again. Newcomers have 0.5.
+/// Reputation below which a vehicle counts as distrusted; from this value on it counts as
+/// trustworthy again. Newcomers have 0.5.
 const DISTRUSTED_SCORE: f64 = 0.4;
 const TRUSTED_SCORE: f64 = 0.5;
 
-/// Minimum number of wrong votes of a distrusted vehicle: a few are no pattern.
+/// Minimum number of wrong votes of a distrusted vehicle: a few wrong votes are not a pattern.
 const MIN_WRONG_VOTES: u64 = 10;
 
 impl Timeline {
@@ -105,7 +106,7 @@ impl Timeline {
         }
     }
 
-    /// Takes the nodes that are there now.
+    /// Sets the nodes that are currently present.
     pub(crate) fn nodes(&mut self, alive: BTreeSet<NodeName>, now: Timestamp) {
         let before = std::mem::take(&mut self.alive);
         for name in alive.difference(&before) {
@@ -117,7 +118,7 @@ impl Timeline {
         self.alive = alive;
     }
 
-    /// Takes all present troubles and who tells of each.
+    /// Sets all current troubles with the nodes that report them.
     pub(crate) fn troubles<'a>(
         &mut self,
         present: impl Iterator<Item = (&'a NodeName, &'a Trouble)>,
@@ -173,7 +174,8 @@ impl Timeline {
         self.events.push_back(TimelineEvent { at_us, kind, text });
     }
 
-    /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all maps, in order.
+    /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all
+    /// maps, in order.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let mut events: Vec<_> = self
             .events
@@ -205,7 +207,7 @@ impl ThinnedSeries {
         }
     }
 
-    /// Adds an item if one is due. A clock that went back makes it due.
+    /// Adds an item if one is due. An item is also due after the clock went back.
     pub(crate) fn push(&mut self, at: Timestamp, item: impl FnOnce() -> Vec<u8>) {
         let age_us = self
             .items
@@ -330,7 +332,8 @@ mod tests {
         assert_eq!(told, expected.map(Some), "a score that varies is no news");
     }
 
-    /// Ten minutes of a small cell are held second by second, an hour of the largest maps within the bound.
+    /// Ten minutes of a small cell are held second by second, an hour of the largest maps within
+    /// the bound.
     #[test]
     fn ten_minutes_are_held_in_bounded_memory() {
         let span = 600 * SECOND;

@@ -1,4 +1,5 @@
-//! Access to a page: the token, the host name of a request, and the security headers of every answer.
+//! Access to a page: the token, the host name of a request, and the security headers of every
+//! answer.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -19,7 +20,8 @@ pub struct PageAccess {
 
 #[derive(Debug)]
 struct PageToken {
-    /// Signatures are compared in constant time, so that timing reveals neither the token nor its length.
+    /// Signatures are compared in constant time, so that timing does not reveal the token or its
+    /// length.
     key: hmac::Key,
     cookie_name: String,
 }
@@ -29,7 +31,8 @@ struct PageToken {
 pub(crate) enum AccessDecision {
     /// The request is answered.
     Allowed,
-    /// The address holds the token: the answer sets a cookie and removes the token from the address.
+    /// The address holds the token: the answer sets a cookie and removes the token from the
+    /// address.
     SignIn,
     /// The token is missing or wrong.
     Unauthorized,
@@ -100,7 +103,8 @@ impl PageAccess {
         }
     }
 
-    /// The cookie of a signed-in browser, which it also sends after following a link from another site.
+    /// The cookie of a signed-in browser, which it also sends after following a link from another
+    /// site.
     pub(crate) fn cookie(&self) -> Option<HeaderValue> {
         let PageToken { key, cookie_name } = self.token.as_ref()?;
         let cookie = BASE64_URL_SAFE_NO_PAD.encode(hmac::sign(key, COOKIE_MESSAGE));

@@ -1,4 +1,4 @@
-//! Limit on connections: those without an allowed request make room for new ones.
+//! Limit on connections: connections without an allowed request make room for new ones.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
@@ -8,8 +8,9 @@ use tokio::sync::oneshot;
 
 use crate::platform::throttle::host_network;
 
-/// Limits connections. A connection with an allowed request is kept until it is answered. When full, a new connection
-/// displaces the oldest other one of the address that has most of them.
+/// Limits connections. A connection with an allowed request is kept until it is answered. If the
+/// limit is reached, a new connection displaces the oldest other connection of the address with
+/// most connections.
 #[derive(Debug, Clone)]
 pub struct ConnectionLimit {
     max: usize,
@@ -38,7 +39,6 @@ pub(crate) struct ConnectionSlot {
     number: u64,
 }
 
-/// An admitted connection.
 #[derive(Debug)]
 pub(crate) struct AdmittedConnection {
     pub(crate) slot: ConnectionSlot,
@@ -57,7 +57,7 @@ impl ConnectionLimit {
         }
     }
 
-    /// A slot for a connection from an address; none while all connections are kept.
+    /// A slot for a connection from an address; `None` while all connections must be kept.
     pub(crate) fn admit(&self, from: IpAddr) -> Option<AdmittedConnection> {
         let mut open = lock(&self.open);
         let displaces = open.by_number.len() >= self.max;

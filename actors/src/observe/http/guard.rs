@@ -19,7 +19,8 @@ use crate::platform::throttle::TokenBucket;
 pub struct PageGuard {
     access: PageAccess,
     answers: Mutex<TokenBucket>,
-    /// Separate, so that requests without access leave the rate of those with access alone.
+    /// Kept separately, so that requests without access don't use up the rate of requests with
+    /// access.
     refusals: Mutex<TokenBucket>,
     count: Box<dyn Fn(HttpRefusal) + Send + Sync>,
 }
@@ -33,14 +34,14 @@ pub enum HttpRefusal {
     Throttled,
 }
 
-/// Burst of requests: some tabs open together unhindered.
+/// Burst of requests, enough for several tabs that open at once.
 const BURST: u32 = 512;
 
 /// Time between further requests after a burst.
 const REQUEST_INTERVAL: Duration = Duration::from_millis(5);
 
 impl PageGuard {
-    /// A guard that tells `count` of each refusal.
+    /// A guard that calls `count` for each refusal.
     pub fn new(access: PageAccess, count: impl Fn(HttpRefusal) + Send + Sync + 'static) -> Self {
         let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
         Self {

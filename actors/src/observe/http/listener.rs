@@ -17,23 +17,25 @@ use tokio_io_timeout::TimeoutStream;
 use super::connection_limit::{AdmittedConnection, ConnectionLimit, ConnectionSlot};
 use crate::platform::throttle::host_network;
 
-/// The host of a browser, as hosts are counted: an IPv4 address or an IPv6 /64 network. Every request has it as an extension.
+/// The host of a browser, as hosts are counted: an IPv4 address or an IPv6 /64 network. Every
+/// request has it as an extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BrowserHost(pub IpAddr);
 
-/// Wait after a connection could not be accepted, most likely for want of file descriptors.
+/// Wait after a connection could not be accepted, most likely because file descriptors ran out.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 
 /// Maximum time for the head of a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Maximum time in which a browser reads nothing of an answer.
+/// Maximum time in which a browser reads no byte of an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Maximum bytes that wait for one browser, beside its socket's buffer.
+/// Maximum number of bytes queued for one browser, in addition to its socket's buffer.
 const MAX_BUFFER_BYTES: usize = 64 * 1024;
 
-/// Accepts connections within a limit, without end; `count_refused` is called for each that gets no place or loses it.
+/// Accepts connections within a limit and does not return; `count_refused` is called for each
+/// connection that gets no slot or loses it.
 pub async fn accept(
     listener: &TcpListener,
     limit: &ConnectionLimit,
@@ -71,7 +73,7 @@ pub async fn accept(
     }
 }
 
-/// Answers one request and closes the connection: an idle one would occupy a slot.
+/// Answers one request and closes the connection, because an idle connection would occupy a slot.
 async fn answer(
     stream: TcpStream,
     host: BrowserHost,

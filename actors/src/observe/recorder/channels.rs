@@ -1,8 +1,9 @@
 //! Channels of a log: JSON messages under stable schema names.
 //!
-//! `ecod.*` are payloads of the cell and facts about the recording node; `foxglove.*` are drawings for viewers. Topics
-//! are those of the cell without its root, such as `detections/euclid`. Messages without a topic in the cell are on
-//! `node/…`, `scene/…`, `tf`, `log`, `camera`, `camera_calibration` and `camera_boxes`.
+//! `ecod.*` are payloads of the cell and facts about the recording node; `foxglove.*` are drawings
+//! for viewers. Topics are the cell's topics without its root, such as `detections/euclid`.
+//! Messages without a topic in the cell are on `node/…`, `scene/…`, `tf`, `log`, `camera`,
+//! `camera_calibration` and `camera_boxes`.
 
 use std::collections::BTreeMap;
 
@@ -61,7 +62,7 @@ schemas! {
     LedgerShare(wire::LedgerShare) = "ecod.LedgerShare",
     /// A node's status.
     NodeStatus(wire::NodeStatus) = "ecod.NodeStatus",
-    /// A change of the leadership as the recording node sees it.
+    /// A change of the leadership as observed by the recording node.
     Leadership(LeadershipChange) = "ecod.Leadership",
     /// Counters of the recording node.
     Counters(CounterReading) = "ecod.Counters",
@@ -77,7 +78,7 @@ schemas! {
     CompressedImage(foxglove::picture::CompressedImage) = "foxglove.CompressedImage",
     /// The optics of a camera's images.
     CameraCalibration(foxglove::picture::CameraCalibration) = "foxglove.CameraCalibration",
-    /// Boxes of what was detected in a camera image.
+    /// Boxes of the detections in a camera image.
     ImageAnnotations(foxglove::picture::ImageAnnotations) = "foxglove.ImageAnnotations",
 }
 
@@ -88,7 +89,7 @@ impl SchemaName {
     }
 }
 
-/// The leadership from now on, as the recording node sees it.
+/// The leadership from now on, as observed by the recording node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LeadershipChange {
     /// The recording node.

@@ -16,28 +16,34 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 pub struct RecordConfig {
     /// Directory of the log, created if missing. Required.
     pub dir: PathBuf,
-    /// Name under which the log is kept. Default the node's; an observer's own name would differ in every process.
+    /// Name under which the log is kept. Default: the node's name. An observer's own name would
+    /// differ in every process.
     #[serde(skip)]
     pub name: Option<NodeName>,
-    /// Maximum size of a file in megabytes. Default 256. Trade-off: smaller files lose less to a broken disk and copy
-    /// faster; larger ones are fewer.
+    /// Maximum size of a file in megabytes. Default 256. Trade-off: smaller files lose less to a
+    /// broken disk and copy faster; larger ones are fewer.
     pub max_file_mb: u64,
     /// Maximum age of a file in seconds. Default 3600.
     pub max_file_s: u64,
-    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are deleted first.
+    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are
+    /// deleted first.
     pub max_total_mb: u64,
-    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and losses are counted.
+    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and
+    /// losses are counted.
     pub min_free_mb: u64,
-    /// Maximum entries that wait for the disk. Default 4096. Further ones are dropped and counted.
+    /// Maximum entries queued for the disk. Default 4096. Further entries are dropped and counted.
     pub queue: usize,
-    /// True if to write scenes and transforms for Foxglove and Lichtblick. Default true. They double the log.
+    /// Whether to write scenes and transforms for Foxglove and Lichtblick. Default true. They
+    /// double the log.
     pub drawable: bool,
-    /// True if a node that never leads records all reports of its cell. Default false. A node that may lead always does.
+    /// Whether a node that cannot lead records all reports of its cell. Default false. A node that
+    /// may lead always records them.
     pub reports: bool,
-    /// Camera images a second, as JPEG. Default 0, none. Each takes 50 to 100 kB at 640x480.
+    /// Camera images per second, as JPEG. Default 0, which disables them. Each takes 50 to 100 kB
+    /// at 640x480.
     pub camera_hz: f64,
-    /// Port on 127.0.0.1 that serves the log live to Foxglove and Lichtblick. Default none. They expect 8765; 0 takes a
-    /// free port.
+    /// Port on 127.0.0.1 that serves the log live to Foxglove and Lichtblick. Default: not set. The
+    /// viewers expect 8765; 0 takes a free port.
     #[cfg(feature = "foxglove")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub live_port: Option<u16>,
@@ -74,7 +80,7 @@ impl RecordConfig {
     /// Checks every value, but not whether the directory can be written.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.dir.as_os_str().is_empty() {
             return Err(ConfigError::new("dir", "\"\"", "a directory"));
@@ -100,7 +106,7 @@ impl RecordConfig {
         Duration::from_secs(self.max_file_s)
     }
 
-    /// Maximum bytes of all files beside the one being written.
+    /// Maximum bytes of all files except the one being written.
     pub(crate) fn max_old_bytes(&self) -> u64 {
         (self.max_total_mb - self.max_file_mb) * MEGABYTE
     }

@@ -15,10 +15,11 @@ pub const EXTENSION: &str = "mcap";
 /// Maximum number of files that begin in the same second.
 const MAX_FILES_PER_SECOND: u32 = 1000;
 
-/// Creates a log file that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. Names sort by time.
+/// Creates a log file that begins `at`, such as `euclid-20261121T100500Z-000.mcap`. Names sort by
+/// time.
 ///
 /// # Errors
-/// The operating system's, and when fewer than `min_free` bytes are free.
+/// Returns the operating system's error, or an error if fewer than `min_free` bytes are free.
 pub(crate) fn create(
     dir: &Path,
     node: &NodeName,
@@ -46,7 +47,7 @@ pub(crate) fn create(
 /// Checks that the disk has room for a log.
 ///
 /// # Errors
-/// The operating system's, and when fewer than `min_free` bytes are free.
+/// Returns the operating system's error, or an error if fewer than `min_free` bytes are free.
 pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
     let free = free_bytes(dir)?;
     if free < min_free {
@@ -63,7 +64,7 @@ pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
 /// Bytes on the disk of `dir` that an unprivileged program may still write.
 ///
 /// # Errors
-/// The operating system's.
+/// Returns the operating system's error.
 pub fn free_bytes(dir: &Path) -> io::Result<u64> {
     let disk = statvfs(dir)?;
     Ok(disk.f_bavail.saturating_mul(disk.f_frsize))
@@ -72,7 +73,7 @@ pub fn free_bytes(dir: &Path) -> io::Result<u64> {
 /// The log files of a directory in the order of their names.
 ///
 /// # Errors
-/// The operating system's about the directory.
+/// Returns the operating system's error about the directory.
 pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
     let is_log = |path: &PathBuf| {
         path.extension()
@@ -86,10 +87,11 @@ pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Deletes this node's oldest files until the rest has at most `max_bytes`; returns the number deleted.
+/// Deletes this node's oldest files until the rest has at most `max_bytes`; returns the number
+/// deleted.
 ///
 /// # Errors
-/// The operating system's.
+/// Returns the operating system's error.
 pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<usize> {
     let mut kept = 0;
     let mut deleted = 0;
@@ -107,7 +109,8 @@ pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<u
     Ok(deleted)
 }
 
-/// True if a file belongs to the node: exactly a time and a number follow, as one name may begin with another.
+/// True if a file belongs to the node: exactly a time and a number follow, as one name may begin
+/// with another.
 fn is_of(path: &Path, node: &NodeName) -> bool {
     let name = path.file_stem().and_then(|stem| stem.to_str());
     let rest = name.and_then(|name| name.strip_prefix(node.as_str())?.strip_prefix('-'));

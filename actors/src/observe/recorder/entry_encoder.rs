@@ -1,4 +1,5 @@
-//! Encoding of log entries as JSON messages: the payloads themselves, and drawings of them for viewers.
+//! Encoding of log entries as JSON messages: the payloads themselves, and drawings of them for
+//! viewers.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -37,7 +38,7 @@ pub(crate) trait MessageSink {
     /// Takes a message.
     ///
     /// # Errors
-    /// When it cannot be kept; the remaining messages of its entry are then skipped.
+    /// Returns an error if it cannot be kept; the remaining messages of its entry are then skipped.
     fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()>;
 }
 
@@ -48,7 +49,7 @@ pub(crate) struct EntryEncoder {
     style: SceneStyle,
     /// Latest frame of each vehicle that was drawn, and whether the vehicle reports for PACE.
     drawn: BTreeMap<NodeName, (Timestamp, bool)>,
-    /// Vehicles of late, each with the time of its entry, and the time at which all were drawn.
+    /// Recent vehicles, each with the time of its entry, and the time at which all were last drawn.
     vehicles: BTreeMap<NodeName, (Timestamp, SceneEntity)>,
     vehicles_drawn_at: Timestamp,
     /// Buffer reused for every message.
@@ -56,7 +57,7 @@ pub(crate) struct EntryEncoder {
 }
 
 impl EntryEncoder {
-    /// An encoder that also draws entries of a cell with these known locations if they are to be `drawable`.
+    /// Creates an encoder. With `drawable` it also draws entries of a cell with these landmarks.
     pub(crate) fn new(node: NodeName, landmarks: &[LandmarkConfig], drawable: bool) -> Self {
         Self {
             node,
@@ -187,7 +188,8 @@ impl EntryEncoder {
         }
     }
 
-    /// All vehicles of late with this one, if it is time to draw them: a viewer that begins in the middle has the last message alone.
+    /// All recent vehicles including this one, if it is time to draw them: a viewer that starts in
+    /// the middle of a log only has the last message.
     fn vehicles(
         &mut self,
         at: Timestamp,
@@ -211,8 +213,9 @@ impl EntryEncoder {
         Some(SceneUpdate::new(report.captured_at_us, vehicles))
     }
 
-    /// True for the first report of a frame: of both kinds and by whatever broker, a vehicle is drawn once. Votes have not
-    /// all objects; they are drawn where a vehicle sends nothing else.
+    /// True for the first report of a frame: a vehicle is drawn once, although reports of both
+    /// kinds arrive over several brokers. Votes do not contain all objects; they are drawn if a
+    /// vehicle sends no other reports.
     fn is_to_be_drawn(
         &mut self,
         kind: ReportKind,
@@ -247,10 +250,10 @@ impl EntryEncoder {
     }
 }
 
-/// Vehicles whose latest frame is remembered; beyond them, all are forgotten.
+/// Maximum number of vehicles whose latest frame is stored; when it is exceeded, all are dropped.
 const MAX_DRAWN: usize = 4096;
 
-/// Time between two drawings of all vehicles, and time for which one that is silent is among them.
+/// Time between two drawings of all vehicles, and time for which a silent vehicle is included.
 const VEHICLES_PERIOD: Duration = Duration::from_millis(100);
 const VEHICLE_SHOWN_FOR: Duration = Duration::from_secs(1);
 
@@ -296,7 +299,7 @@ impl<S: MessageSink> Output<'_, S> {
         )?;
         let optical = |_: &SceneStyle| FrameTransform::optical(&picture.reporter, made_at);
         self.draw(SchemaName::FrameTransform, "tf", made_at, optical)?;
-        // Viewers draw over a picture what they have when it comes.
+        // Viewers draw the messages that they already have over a picture when it arrives.
         self.put(
             SchemaName::CompressedImage,
             topic("camera"),

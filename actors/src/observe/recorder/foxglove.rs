@@ -1,8 +1,9 @@
-//! Drawings for Foxglove and Lichtblick, with the names and fields of their published schemas. Unused list fields are
-//! written as empty lists.
+//! Drawings for Foxglove and Lichtblick, with the names and fields of their published schemas.
+//! Unused list fields are written as empty lists.
 //!
-//! The fixed frame is `map`: east, north, up in metres. Each camera with a pose has a frame of the name under which it
-//! reports, x along its axis and z up, and below it `<name>/optical`, z along the axis and x to the right.
+//! The fixed frame is `map`: east, north, up in metres. Each camera with a pose has a frame of the
+//! name under which it reports, x along its axis and z up, and below it `<name>/optical`, z along
+//! the axis and x to the right.
 
 pub(crate) mod picture;
 pub(crate) mod scene;
@@ -137,7 +138,7 @@ impl FrameTransform {
         }
     }
 
-    /// The frame of a camera's pictures within that of the camera.
+    /// The frame of a camera's pictures, relative to the frame of the camera.
     pub(crate) fn optical(reporter: &NodeName, at: Timestamp) -> Self {
         let rotation = Quaternion {
             x: -0.5,
@@ -161,7 +162,7 @@ fn plane_pose(x_m: f64, y_m: f64, heading_rad: f64) -> FoxglovePose {
     camera_pose(&WirePose::new(x_m, y_m, heading_rad))
 }
 
-/// Pose of a camera, on the ground and level as far as nothing else is stated.
+/// Pose of a camera; without stated height and tilt, it is on the ground and level.
 fn camera_pose(pose: &WirePose) -> FoxglovePose {
     let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
     let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, pose.heading_rad);

@@ -31,7 +31,8 @@ pub struct ImageRecorder {
 }
 
 impl ImageRecorder {
-    /// As configured, for a camera of a vehicle; `None` without a log, or without images in it.
+    /// A recorder as configured, for a camera of a vehicle; `None` without a log, or without images
+    /// in it.
     pub fn new(
         config: Option<&RecordConfig>,
         vehicle: &NodeName,
@@ -58,7 +59,8 @@ impl ImageRecorder {
         if frame.captured_at < self.due {
             return;
         }
-        // By whole periods, so that frames that come unevenly are not lost; anew after a pause.
+        // In whole periods, so that frames that arrive unevenly are not lost; restarted after a
+        // pause.
         let next = self.due + self.period;
         self.due = if next + self.period <= frame.captured_at {
             frame.captured_at + self.period
@@ -132,7 +134,8 @@ mod tests {
         );
     }
 
-    /// A Pi without a clock of its own starts years ago: viewers look for the vehicle's pose at the picture's time.
+    /// A Pi without a real-time clock starts with a time years ago: viewers look for the vehicle's
+    /// pose at the picture's time.
     #[test]
     fn a_picture_is_dated_as_reports_are() {
         let clock = CellClock::default();

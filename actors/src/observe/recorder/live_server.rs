@@ -1,6 +1,7 @@
 //! Live view of the log for Foxglove and Lichtblick.
 //!
-//! The protocol has no passwords, so the server listens on loopback only. A viewer that is too slow loses messages.
+//! The protocol has no passwords, so the server listens on loopback only. A viewer that is too slow
+//! loses messages.
 
 use std::collections::HashMap;
 use std::sync::Arc;

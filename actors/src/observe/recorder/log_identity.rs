@@ -22,7 +22,7 @@ pub struct LogIdentity {
     pub version: String,
     /// Configuration of the fusion.
     pub fusion: FusionConfig,
-    /// Known locations of the cell.
+    /// Landmarks of the cell.
     pub landmarks: Vec<LandmarkConfig>,
 }
 
@@ -32,9 +32,9 @@ pub enum LogIdentityError {
     /// A key is missing or has an unusable value.
     #[error("metadata `{key}` of the log cannot be used: {reason}")]
     Key {
-        /// The key.
+        /// Configuration key.
         key: &'static str,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
 }
@@ -95,7 +95,7 @@ impl LogIdentity {
     /// Reads the record's content.
     ///
     /// # Errors
-    /// [`LogIdentityError`] naming the first key that cannot be used.
+    /// Returns a [`LogIdentityError`] that names the first key that cannot be used.
     pub(crate) fn from_map(map: &BTreeMap<String, String>) -> Result<Self, LogIdentityError> {
         let fusion: FusionConfig = json(map, "fusion")?;
         fusion

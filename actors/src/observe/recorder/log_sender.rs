@@ -1,4 +1,4 @@
-//! Queue from the parts of a node to the recorder. Sending never waits.
+//! Queue from the parts of a node to the recorder. Sending does not block.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
@@ -55,7 +55,7 @@ pub enum LogItem {
     Picture(Box<CapturedPicture>),
 }
 
-/// A camera's picture, with what was detected in it.
+/// A camera's picture with its detections.
 #[derive(Debug, Clone)]
 pub struct CapturedPicture {
     /// Name of the camera, if it has one.
@@ -68,14 +68,15 @@ pub struct CapturedPicture {
     pub captured_at: Timestamp,
     /// Height of the picture in pixels.
     pub height: u32,
-    /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for another shape.
+    /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for
+    /// another shape.
     pub optics: Option<(Intrinsics, Option<[f64; 5]>)>,
     /// Detections in pixels of the picture, before distortion is removed.
     pub detections: Vec<Detection>,
 }
 
 impl LogItem {
-    /// True if the log holds anything of it.
+    /// True if the log contains any part of the item.
     pub(crate) fn is_written(&self) -> bool {
         !matches!(self, Self::Round(_))
     }
@@ -88,7 +89,7 @@ impl LogItem {
         )
     }
 
-    /// True if an exact rerun of the aggregator needs it.
+    /// True if an exact replay of the aggregator needs it.
     pub(crate) fn is_of_journal(&self) -> bool {
         matches!(self, Self::Report(..) | Self::Journal(_))
     }
@@ -126,7 +127,8 @@ impl LogSender {
         }))
     }
 
-    /// Queues an item. A full queue drops and counts it, but for the latest change of settings, which waits beside the queue.
+    /// Queues an item. A full queue drops and counts it, except for the latest change of settings,
+    /// which is kept separately.
     pub fn send(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
@@ -145,7 +147,7 @@ impl LogSender {
         }
     }
 
-    /// Takes the change of settings that waits beside the queue, if its time has come.
+    /// Takes the change of settings that is kept outside the queue, if its time has come.
     pub(crate) fn take_change(&self, now: Timestamp) -> Option<LogEntry> {
         self.change().take_if(|change| change.at <= now)
     }
@@ -154,7 +156,7 @@ impl LogSender {
         self.0.change.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts lost entries, and those of the journal that the log must note.
+    /// Counts lost entries, and the lost journal entries that the log must record.
     pub(crate) fn count_lost(&self, entries: u64, of_journal: u64) {
         self.0.counters.add(Event::RecordDropped, entries);
         self.0.missing.fetch_add(of_journal, Ordering::Relaxed);
@@ -176,7 +178,8 @@ impl LogSender {
         &self.0.counters
     }
 
-    /// Replaces the queue; `None` disconnects the recorder. One that begins has the present settings.
+    /// Replaces the queue; `None` disconnects the recorder. A recorder that starts gets the current
+    /// settings.
     pub(crate) fn connect(&self, queue: Option<SyncSender<LogEntry>>) {
         if queue.is_some() {
             self.change().take();

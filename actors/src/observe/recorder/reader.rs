@@ -44,13 +44,14 @@ pub struct LogMessage {
     pub json: Vec<u8>,
 }
 
-/// An unusable part of a log. After all errors but [`LogError::Unreadable`] the rest remains usable.
+/// An unusable part of a log. After all errors but [`LogError::Unreadable`] the rest remains
+/// usable.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
     /// The file cannot be read.
     #[error("cannot read {path}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -58,13 +59,13 @@ pub enum LogError {
     /// The file has no end, as after its writer was killed.
     #[error("{path} was not finished: it ends before its last messages")]
     Truncated {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
     /// The file is damaged from some position on.
     #[error("{path} is damaged: messages after the damage are ignored")]
     Damaged {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The damage.
         source: McapError,
@@ -72,7 +73,7 @@ pub enum LogError {
     /// A later version of the program wrote it.
     #[error("{path} has version {found} of the log, this program knows {known}", known = LogIdentity::VERSION)]
     Newer {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Its version.
         found: u64,
@@ -80,9 +81,9 @@ pub enum LogError {
     /// Its metadata cannot be used.
     #[error("{path}")]
     Identity {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The problem.
+        /// Description of the problem.
         source: LogIdentityError,
     },
 }
@@ -112,7 +113,7 @@ impl LogReader {
     /// True if the file is in MCAP format.
     ///
     /// # Errors
-    /// [`LogError::Unreadable`].
+    /// Returns [`LogError::Unreadable`].
     pub fn recognises(path: &Path) -> Result<bool, LogError> {
         let mut beginning = Vec::new();
         let read = bounded_file::open(path)
@@ -127,7 +128,7 @@ impl LogReader {
     /// Opens a file.
     ///
     /// # Errors
-    /// [`LogError::Unreadable`].
+    /// Returns [`LogError::Unreadable`].
     pub fn open(path: &Path) -> Result<Self, LogError> {
         let file = bounded_file::open(path).map_err(|source| LogError::Unreadable {
             path: path.into(),

@@ -1,8 +1,8 @@
 //! JSON Schemas in the form that Foxglove and Lichtblick read.
 //!
-//! They drop a channel whose schema has a field that they do not understand. A field needs one `type`, an array needs
-//! `items`, alternatives are named numbers, and references are not followed. Optional fields are `nullable`, as in
-//! OpenAPI 3.0. Alternatives below `anyOf` are ignored.
+//! They drop a channel whose schema has a field that they do not understand. A field needs one
+//! `type`, an array needs `items`, alternatives are named numbers, and references are not followed.
+//! Optional fields are `nullable`, as in OpenAPI 3.0. Alternatives below `anyOf` are ignored.
 
 use schemars::generate::SchemaSettings;
 use schemars::transform::transform_subschemas;
@@ -49,7 +49,7 @@ fn simplify(schema: &mut Schema) {
     }
 }
 
-/// Reduces the alternatives of a field to what they have in common.
+/// Reduces the alternatives of a field to their common part.
 fn merge_alternatives(schema: &mut Map<String, Value>, mut alternatives: Vec<Value>) {
     if alternatives
         .iter()
@@ -85,7 +85,7 @@ mod tests {
     use super::super::SchemaName;
     use super::*;
 
-    /// Fails where viewers would leave out the channel.
+    /// Fails if viewers would leave out the channel.
     fn check(path: &str, schema: &Value) {
         assert_eq!(schema["type"], "object", "{path}");
         for (name, field) in schema["properties"].as_object().into_iter().flatten() {

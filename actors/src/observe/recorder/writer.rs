@@ -1,4 +1,4 @@
-//! Thread that writes the log and alone waits for the disk.
+//! Thread that writes the log, so that other threads don't wait for the disk.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
@@ -127,7 +127,7 @@ impl LogWriter {
         }
     }
 
-    /// Begins the next file if there is none, unless an attempt has just failed.
+    /// Starts the next file if there is none, unless an attempt has just failed.
     fn open(&mut self, entry: &LogEntry) {
         if self.file.is_some() || self.retry_at.is_some_and(|at| Instant::now() < at) {
             return;
@@ -145,7 +145,8 @@ impl LogWriter {
     fn begin(&mut self, entry: &LogEntry) -> McapResult<LogFile> {
         let (dir, node) = (&self.config.dir, &self.identity.node);
         std::fs::create_dir_all(dir)?;
-        // Deletion comes first, since it may free the space that is needed. Its failure does not end the log.
+        // Deletion comes first, since it may free the space that is needed. Its failure does not
+        // end the log.
         if let Err(error) = disk::prune(dir, node, self.config.max_old_bytes()) {
             tracing::warn!(dir = %dir.display(), %error, "cannot delete old logs");
         }
@@ -166,7 +167,8 @@ impl LogWriter {
         Ok(file)
     }
 
-    /// Follows the state and settings of the aggregator, for files that begin in the middle of its run.
+    /// Follows the state and settings of the aggregator, for files that begin in the middle of its
+    /// run.
     fn track_aggregator(&mut self, item: &LogItem) {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {
@@ -296,7 +298,7 @@ mod tests {
         LogReader::open(path).unwrap().filter_map(message).collect()
     }
 
-    /// When the log says that entries are missing, and how many.
+    /// Times at which the log records missing entries, and their numbers.
     fn missing(messages: &[LogMessage]) -> Vec<(Timestamp, u64)> {
         let journal = messages
             .iter()
@@ -510,7 +512,7 @@ mod tests {
         assert_eq!(missing(&next), [(Timestamp(5_000_000), 3)]);
     }
 
-    /// The number of a round is for files that begin later; it is no reason to begin one.
+    /// The number of a round is for files that start later; it does not cause a new file.
     #[test]
     fn files_and_gaps_bear_the_time_of_what_is_written() {
         let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));

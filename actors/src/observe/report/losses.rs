@@ -84,7 +84,7 @@ impl Losses {
     }
 }
 
-/// Losses in a reading. Copies through a second broker (`out_of_order`) are none.
+/// Losses in a reading. Copies through a second broker (`out_of_order`) don't count as losses.
 fn counts(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
     let is_loss = |name: &str| EVENTS.iter().any(|event| event.as_str() == name);
     let events = reading.events.iter().filter(move |(name, _)| is_loss(name));

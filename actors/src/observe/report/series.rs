@@ -13,8 +13,8 @@ impl Samples {
         self.values.push((at, value));
     }
 
-    /// Points by seconds since `start`. Of each of `parts` time slices, only minimum and maximum remain, so that peaks
-    /// survive.
+    /// Points by seconds since `start`. Of each of `parts` time slices, only minimum and maximum
+    /// remain, so that peaks survive.
     pub(super) fn points(&self, start: Timestamp, seconds: f64, parts: usize) -> Vec<(f64, f64)> {
         let points = self
             .values

@@ -1,4 +1,5 @@
-//! Timeline of a log: what the dashboard's page shows of a live cell, in the cell's time.
+//! Timeline of a log: the same view that the dashboard's page has of a live cell, in the cell's
+//! time.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -46,7 +47,8 @@ pub(super) struct RecordedPicture {
     data: String,
 }
 
-/// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name alone.
+/// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name
+/// alone.
 fn reporter<'de, D: Deserializer<'de>>(frame: D) -> Result<NodeName, D::Error> {
     let frame = String::deserialize(frame)?;
     NodeName::new(frame.strip_suffix(OPTICAL_FRAME).unwrap_or(&frame)).map_err(D::Error::custom)
@@ -81,7 +83,7 @@ impl Default for LogTimeline {
 /// Microseconds from the recording node's clock to the cell's time, by the first round in a file.
 ///
 /// # Errors
-/// [`LogError::Unreadable`].
+/// Returns [`LogError::Unreadable`].
 pub(super) fn cell_offset_us(path: &Path) -> Result<i64, LogError> {
     let mut offsets = LogReader::open(path)?.filter_map(|event| match event {
         Ok(LogEvent::Message(it))
@@ -196,7 +198,8 @@ impl LogTimeline {
         });
     }
 
-    /// Map, timeline and pictures as HTML, with the scripts that draw them; empty if the log has no leader.
+    /// Map, timeline and pictures as HTML, with the scripts that draw them; empty if the log has no
+    /// leader.
     pub(super) fn html(&self, leaders: &[LeaderRounds]) -> String {
         if leaders.is_empty() {
             return String::new();

@@ -9,10 +9,11 @@ use strum::{IntoStaticStr, VariantArray};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "snake_case")]
 pub enum ShedReason {
-    /// A node, an address or a local client published more often than `broker.max_messages_hz`. The embedded broker
-    /// dropped the message.
+    /// A node, an address or a local client published more often than `broker.max_messages_hz`. The
+    /// embedded broker dropped the message.
     BrokerThrottled,
-    /// A client of the embedded broker read too slowly. The oldest message for it was dropped, or the rest when it was cut.
+    /// A client of the embedded broker read too slowly. The oldest message for it was dropped, or
+    /// the rest when it was cut.
     ReaderSlow,
     /// A vehicle reported more often than `mqtt.max_report_hz`; the report was not decoded.
     ReportThrottled,
@@ -20,9 +21,10 @@ pub enum ShedReason {
     LedgerThrottled,
     /// A node published its status more often than `mqtt.max_report_hz`; it was not decoded.
     StatusThrottled,
-    /// A vehicle and its parts reported more than 15,000 objects a second; the report was not fused.
+    /// A vehicle and its parts reported more than 15,000 objects a second; the report was not
+    /// fused.
     ObjectsThrottled,
-    /// A newer report of the same vehicle came before the fuser read this one.
+    /// A newer report of the same vehicle arrived before the fuser read this one.
     ReportReplaced,
     /// A neighbouring cell sent maps more often than 20 times a second; the map was not decoded.
     CellThrottled,
@@ -41,7 +43,7 @@ impl ShedReason {
 /// Messages of one source that were not used for one reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SourceCount<R> {
-    /// Why.
+    /// Reason.
     pub reason: R,
     /// Name of the node, or address or id of the broker's client.
     pub source: String,

@@ -1,6 +1,7 @@
 //! Bytes that the broker holds for its clients, bounded for each principal and in total.
 //!
-//! Two kinds of bytes are held for a client: those that it does not read, and packets that it has begun and not ended.
+//! Two kinds of bytes are held for a client: bytes that it has not read, and incomplete packets
+//! that it has sent.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,7 +9,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use ecod::model::time::Timestamp;
 use tokio::sync::oneshot;
 
-/// Bytes held by connection. Beyond a bound, the connection that has held some for the longest time gives way: it is cut.
+/// Held bytes by connection. If a bound is exceeded, the connection that has held bytes for the
+/// longest time is cut.
 #[derive(Debug, Clone)]
 pub(super) struct Backlog {
     table: Arc<Mutex<BacklogTable>>,
@@ -37,11 +39,13 @@ struct Holding {
     cut: Option<oneshot::Sender<()>>,
 }
 
-/// Maximum bytes held for one principal, and in total, where packets are not larger than maps by default.
+/// Maximum bytes held for one principal, and in total, where packets are not larger than maps by
+/// default.
 const MAX_BYTES_EACH: usize = 10 * 1024 * 1024;
 const MAX_BYTES: usize = 32 * 1024 * 1024;
 
-/// Room beside the largest packet of a principal, and largest packets in total, where they are larger.
+/// Room in addition to the largest packet of a principal, and number of largest packets in total,
+/// if packets are larger.
 const SPARE_BYTES: usize = 2 * 1024 * 1024;
 const MAX_PACKETS: usize = 4;
 
@@ -62,7 +66,7 @@ impl Backlog {
         }
     }
 
-    /// A part for one more connection, and a receiver that ends when the connection has to.
+    /// An entry for one more connection, and a receiver that ends when the connection must be cut.
     pub(super) fn open(&self, principal: Option<Arc<str>>) -> (BacklogSlot, oneshot::Receiver<()>) {
         let mut table = self.table();
         let number = table.next_number;
@@ -96,7 +100,7 @@ impl BacklogSlot {
         self.set(|holding| holding.unread = bytes, now);
     }
 
-    /// Records the bytes of a packet that the client has not ended.
+    /// Records the bytes of an incomplete packet of the client.
     pub(super) fn set_unfinished(&self, bytes: usize, now: Timestamp) {
         self.set(|holding| holding.unfinished = bytes, now);
     }
@@ -142,7 +146,8 @@ impl Drop for BacklogSlot {
 }
 
 impl BacklogTable {
-    /// Cuts connections, the oldest holding first, until the rest of a group hold no more than a bound.
+    /// Cuts connections, the oldest holding first, until the rest of a group holds at most the
+    /// bound.
     fn cut_oldest(&mut self, is_member: impl Fn(&Holding) -> bool, bound: usize) {
         loop {
             let members = || {
@@ -173,7 +178,7 @@ impl BacklogTable {
 }
 
 impl Holding {
-    /// Held bytes; those of a connection that is being cut do not count.
+    /// Held bytes; connections that are being cut don't count.
     fn bytes(&self) -> usize {
         if self.cut.is_some() {
             self.unread + self.unfinished

@@ -6,23 +6,25 @@ use std::time::Duration;
 
 use ecod::model::time::Timestamp;
 
-/// Paces what principals send: all connections of one together. Nothing is lost, the sender waits.
+/// Limits the rate of bytes that principals send, for all connections of a principal together.
+/// Excess bytes are not lost; the sender waits.
 #[derive(Debug, Default)]
 pub(super) struct ByteThrottle(Mutex<HashMap<Arc<str>, Timestamp>>);
 
 /// Bytes per second of one principal. A vehicle sends some tens of kilobytes.
 const BYTES_PER_S: u64 = 4 * 1024 * 1024;
 
-/// Bytes that count for each packet beside its own, as small packets cost time as well.
+/// Bytes that are added for each packet, because small packets cost time as well.
 const PACKET_BYTES: usize = 1024;
 
-/// Factor on the rate of the leader, which sends maps, and of this machine without certificates, where a cell may run.
+/// Factor on the rate for the leader, which sends maps, and for this machine without certificates,
+/// where a cell may run.
 const LARGE_SHARE: u64 = 8;
 
 /// Time of silence after which as much may be sent at once: two of the largest packets.
 const BURST: Duration = Duration::from_secs(4);
 
-/// Principals after which those are forgotten that have sent nothing lately.
+/// Number of principals from which inactive principals are removed.
 const MAX_PRINCIPALS: usize = 4096;
 
 impl ByteThrottle {
@@ -50,7 +52,7 @@ impl ByteThrottle {
 mod tests {
     use super::*;
 
-    /// Bytes sent in a time by two connections that wait as they are told.
+    /// Bytes sent in a time by two connections that wait as required.
     fn sent(large: bool, packet: usize, seconds: u64) -> usize {
         let (throttle, principal) = (ByteThrottle::default(), "gauss".into());
         let (mut waits, mut sent) = ([Timestamp(0); 2], 0);

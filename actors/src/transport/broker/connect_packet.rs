@@ -8,7 +8,8 @@ use super::client_rejection::ClientRejection;
 #[derive(Debug)]
 pub(super) struct ConnectPacket {
     pub(super) packet: Vec<u8>,
-    /// The client id; empty if the broker is to draw one, and where rmqtt will find the packet malformed.
+    /// The client id; empty if the broker should generate one, and if rmqtt will find the packet
+    /// malformed.
     pub(super) client_id: String,
     /// True if the client id is empty, so that the broker draws one.
     pub(super) has_generated_id: bool,
@@ -22,7 +23,8 @@ const CONNECT: u8 = 0x10;
 /// The protocol level of MQTT 5, in which properties come before the client id.
 const MQTT_5: u8 = 5;
 
-/// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first bytes for ever.
+/// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first
+/// bytes forever.
 pub(super) async fn read(
     first: u8,
     stream: &mut (impl AsyncRead + Unpin),
@@ -56,7 +58,8 @@ pub(super) async fn read(
     })
 }
 
-/// Length of the first packet in received bytes, if it is complete. Only built for the fuzz targets.
+/// Length of the first packet in received bytes, if it is complete. Only built for the fuzz
+/// targets.
 #[cfg(fuzzing)]
 pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;
@@ -73,7 +76,7 @@ pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     Some(login.packet.len())
 }
 
-/// The client id in the body of a CONNECT packet; none where rmqtt will find the packet malformed.
+/// The client id in the body of a CONNECT packet; `None` if rmqtt will find the packet malformed.
 fn client_id(body: &[u8]) -> Option<&[u8]> {
     let (_protocol, rest) = text(body)?;
     // Level, flags and the keep-alive.

@@ -11,8 +11,8 @@ use tokio::sync::oneshot;
 use crate::platform::clock;
 use crate::platform::throttle::{TokenBucket, host_network};
 
-/// Limits connections without a login, by source address and in total. Where too many wait, the oldest is evicted: an
-/// honest client logs in at once.
+/// Limits connections without a login, by source address and in total. If too many are waiting, the
+/// oldest is evicted: an honest client logs in at once.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionThrottle(Arc<Mutex<AddressTable>>);
 
@@ -21,7 +21,8 @@ struct AddressTable {
     by_address: HashMap<IpAddr, AddressEntry>,
     /// Throttle shared by all addresses beyond [`MAX_ADDRESSES`].
     overflow: TokenBucket,
-    /// Connections without a login by order of arrival: the source, and a sender whose drop evicts the connection.
+    /// Connections without a login by order of arrival: the source, and a sender whose drop evicts
+    /// the connection.
     pending: BTreeMap<u64, (IpAddr, oneshot::Sender<()>)>,
     next_number: u64,
     pruned_at: Timestamp,
@@ -42,7 +43,8 @@ struct AddressEntry {
 pub(super) enum ClientOrigin {
     /// A throttled address.
     Remote(IpAddr),
-    /// This machine, where a whole cell may run and nothing tells its nodes apart. Only waiting connections are limited.
+    /// This machine, where a whole cell may run and nodes cannot be distinguished. Only waiting
+    /// connections are limited.
     Local,
 }
 
@@ -51,15 +53,17 @@ const MAX_PENDING_PER_ADDRESS: usize = 32;
 const MAX_PENDING_LOCAL: usize = 256;
 const MAX_PENDING: usize = 1024;
 
-/// Factor on the rate of an address from which a client has logged in, and how long it lasts after the last login. A
-/// flood from a node's own address, such as behind address translation, must leave something for the node.
+/// Factor on the rate of an address from which a client has logged in, and how long it lasts after
+/// the last login. A flood from a node's own address, for example behind address translation, must
+/// leave some rate for the node.
 const PRIVILEGED_FACTOR: u32 = 10;
 const PRIVILEGED_FOR: Duration = Duration::from_secs(3600);
 
 /// Maximum addresses with a throttle of their own.
 const MAX_ADDRESSES: usize = 4096;
 
-/// Minimum time between two searches for addresses to forget. A search for every connection would help an attacker.
+/// Minimum time between two searches for outdated addresses. A search for every connection would
+/// help an attacker.
 const PRUNE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The place of a connection that may log in; free when dropped.
@@ -120,7 +124,8 @@ impl ConnectionThrottle {
 }
 
 impl AddressTable {
-    /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in total.
+    /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in
+    /// total.
     fn insert(&mut self, source: IpAddr, limit: usize) -> (u64, oneshot::Receiver<()>) {
         let mut of_source = self
             .pending
@@ -144,7 +149,7 @@ impl AddressTable {
         (number, evicted)
     }
 
-    /// The entry of an address; none when there is no room for one more.
+    /// The entry of an address; `None` if there is no room for one more.
     fn entry(&mut self, source: IpAddr, now: Timestamp) -> Option<&mut AddressEntry> {
         if self.by_address.len() >= MAX_ADDRESSES && !self.by_address.contains_key(&source) {
             if now.since(self.pruned_at) >= PRUNE_INTERVAL {

@@ -1,4 +1,5 @@
-//! The door of a node: programs beside it take part in the cell at its broker, whoever leads.
+//! The local broker of a node: programs on the node's machine exchange messages with the cell
+//! through it, independent of which node leads.
 //!
 //! ```text
 //! Follower, Gateway ── what the node accepted ──> Door ──> `$door/` + topic ──> programs
@@ -6,8 +7,9 @@
 //! program ── report in the node's name ─────────> checked ──> Gateway ──> leader, standby, this node
 //! ```
 //!
-//! The brokers of leader and standby also carry the raw messages of all nodes. Programs have topics of their own there:
-//! the broker puts `$door/` before their filters and takes it off what it delivers. Wildcards of others do not match it.
+//! The brokers of leader and standby also carry the raw messages of all nodes. Programs have their
+//! own topics there: the broker puts `$door/` in front of their filters and removes it from the
+//! messages that it delivers. Wildcards of other clients don't match these topics.
 
 mod programs;
 mod refusals;
@@ -39,19 +41,20 @@ use crate::telemetry::counters::{Counters, Event};
 pub(super) use self::programs::{DoorHooks, TopicPlace};
 pub(super) use self::refusals::DoorRefusal;
 
-/// The node of a door, and its ways to the cell.
+/// The node of a local broker, and its connections to the cell.
 pub struct DoorSetup {
-    /// The node.
+    /// Name of the node.
     pub node: NodeName,
     /// Client id of the node's own gateway.
     pub gateway_id: String,
     /// The cell's topics.
     pub topics: Topics,
-    /// Limits of what the node accepts.
+    /// Limits of the messages that the node accepts.
     pub limits: Limits,
-    /// Encoding of what programs get.
+    /// Encoding of messages to programs.
     pub encoding: Encoding,
-    /// Reports of a vehicle and kind that the cell takes per second. Half of them are for programs.
+    /// Maximum number of reports of a vehicle and kind that the cell accepts per second. Half of
+    /// them are for programs.
     pub max_report_hz: u32,
     /// True if other nodes have links to this broker.
     pub serves_nodes: bool,
@@ -63,15 +66,15 @@ pub struct DoorSetup {
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
     /// Takes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
-    /// Sets the cell's description, given as TOML, or says why not.
+    /// Sets the cell's description, given as TOML, or returns the reason for refusing it.
     pub describe: Arc<dyn Fn(String) -> Result<(), String> + Send + Sync>,
-    /// Has the node receive the reports of all vehicles, or ends that.
+    /// Starts or stops receiving the reports of all vehicles.
     pub watch_reports: Arc<dyn Fn(bool) + Send + Sync>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }
 
-/// The door of a node; by default there is none, and everything given to it is dropped.
+/// Handle of a node's local broker. By default there is none, and all messages are dropped.
 #[derive(Clone, Default)]
 pub struct Door(Option<Arc<DoorState>>);
 
@@ -81,7 +84,7 @@ struct DoorState {
     queue: Mutex<Option<mpsc::Sender<Publication>>>,
     /// Last message of each topic that is retained, for the broker's next run.
     retained: Mutex<BTreeMap<String, Bytes>>,
-    /// Topics of these that the broker's present run lacks: its queue was full.
+    /// Topics of these that are missing in the broker's current run because its queue was full.
     unsent: Mutex<BTreeSet<String>>,
     /// Filters of programs, and whether they match reports.
     filters: Mutex<BTreeMap<(ClientId, TopicFilter), bool>>,
@@ -108,22 +111,24 @@ struct Publication {
 /// Messages that wait for the broker's thread; more are dropped and counted.
 const MAX_WAITING: usize = 256;
 
-/// Minimum time between two descriptions from programs, beyond a burst: each is checked, saved and told to all nodes.
+/// Minimum time between two descriptions from programs, beyond a burst: each is checked, saved and
+/// sent to all nodes.
 const DESCRIPTION_INTERVAL: Duration = Duration::from_secs(1);
 
 const DESCRIPTION_BURST: u32 = 8;
 
-/// Time after which a silent part gives way to another.
+/// Time after which a silent part may be replaced by another.
 const PART_RETENTION: Duration = Duration::from_secs(10);
 
-/// Vehicles without a node whose statuses may be retained. Programs draw any number of names.
+/// Maximum number of vehicles without a node whose statuses are retained. Programs may use any
+/// number of names.
 const MAX_NODELESS: usize = 256;
 
-/// Topics whose last message is retained: as many nodes as a cell can have, and some.
+/// Maximum number of topics whose last message is retained: enough for all nodes of a cell.
 const MAX_RETAINED: usize = 8192;
 
 impl Door {
-    /// The door of a node, for one broker.
+    /// Creates the handle of a node's local broker.
     pub fn new(setup: DoorSetup) -> Self {
         let per_second = (setup.max_report_hz / 2).max(1);
         let interval = Duration::from_secs(1) / per_second;
@@ -152,7 +157,7 @@ impl Door {
         })))
     }
 
-    /// Passes on a map or verdicts that the node accepted.
+    /// Forwards a map or verdicts that the node accepted.
     pub fn publish_round<T: Payload>(&self, topic: &Topic, round: &T) {
         let Some(door) = &self.0 else { return };
         if door.has_readers.load(Ordering::Relaxed) {
@@ -160,22 +165,22 @@ impl Door {
         }
     }
 
-    /// Passes on reputations that the node accepted; the last are retained.
+    /// Forwards reputations that the node accepted; the last ones are retained.
     pub fn publish_reputations(&self, reputations: &Reputations) {
         self.publish_state(&Topic::Reputations, reputations);
     }
 
-    /// Passes on the cell's description as the node has it; the last is retained.
+    /// Forwards the node's current description of the cell; the last one is retained.
     pub fn publish_description(&self, description: &CellDescription) {
         self.publish_state(&Topic::Cell, description);
     }
 
-    /// Passes on the status of a node; the last of each is retained.
+    /// Forwards the status of a node; the last status of each node is retained.
     pub fn publish_status(&self, status: &NodeStatus) {
         self.publish_state(&Topic::Nodes(status.node.clone()), status);
     }
 
-    /// Passes on a vehicle's report. Each passes once, although it may come over two links.
+    /// Forwards a vehicle's report once, although it may arrive over two links.
     pub fn publish_report(&self, kind: ReportKind, report: &ObjectReport) {
         let Some(door) = self
             .0
@@ -189,8 +194,8 @@ impl Door {
         }
     }
 
-    /// Has a node that only follows receive reports while a program reads them. Called again and again: the gateway may
-    /// have been started anew.
+    /// Makes a node that only follows receive reports while a program reads them. Called
+    /// repeatedly, because the gateway may have been restarted.
     pub fn request_reports(&self, follows: bool) {
         let Some(door) = &self.0 else { return };
         let wanted = follows && door.wants_reports.load(Ordering::Relaxed);
@@ -205,7 +210,7 @@ impl Door {
         }
     }
 
-    /// Publishes at the broker's present run, on the broker's thread; never ends.
+    /// Publishes to the broker's current run, on the broker's thread; does not return.
     pub(super) async fn run(self, context: ServerContext) {
         let Some(door) = self.0 else {
             return std::future::pending().await;
@@ -281,8 +286,8 @@ impl DoorState {
         }
     }
 
-    /// Publishes a state that differs from the last one. One vehicle may have any number of parts: these leave half of the
-    /// room to nodes.
+    /// Publishes a state that differs from the last one. One vehicle may have any number of parts,
+    /// so parts use at most half of the room.
     fn retain(&self, publication: Publication) {
         let mut retained = lock(&self.retained);
         let is_known = retained.contains_key(&publication.topic);
@@ -327,7 +332,7 @@ impl DoorState {
         has_room
     }
 
-    /// Notes the filters of programs: what nobody reads is not even encoded.
+    /// Records the filters of programs, so that messages without a reader are not even encoded.
     fn change_filters(&self, change: impl FnOnce(&mut BTreeMap<(ClientId, TopicFilter), bool>)) {
         let mut filters = lock(&self.filters);
         change(&mut filters);

@@ -29,23 +29,26 @@ use crate::platform::clock;
 
 /// An MQTT broker that lives inside the process.
 pub trait MqttBroker: Send {
-    /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may connect at once.
+    /// Listens on `address`, port 0 for a free one, and returns the bound address; clients may
+    /// connect at once.
     ///
     /// # Errors
-    /// [`BrokerError`] names the address; nothing is left running.
+    /// Returns a [`BrokerError`] that names the address; the broker is then fully stopped.
     fn start(&mut self, address: SocketAddr) -> Result<SocketAddr, BrokerError>;
 
-    /// Disconnects all clients and frees the port before it returns; without effect when not started. Retained messages
-    /// are lost. A broker that hangs is abandoned after a moment and may keep its port.
+    /// Disconnects all clients and frees the port before it returns; has no effect on a broker that
+    /// is not started. Retained messages are lost. A broker that hangs is abandoned after a moment
+    /// and may keep its port.
     fn stop(&mut self);
 
     /// State of the broker.
     fn health(&self) -> BrokerHealth;
 
-    /// Stops it and starts it at the address where it serves, or else at `fallback`. Retained messages are lost.
+    /// Stops the broker and starts it at its current address, or at `fallback` if it has none.
+    /// Retained messages are lost.
     ///
     /// # Errors
-    /// As [`MqttBroker::start`]; the broker is then stopped.
+    /// Returns the errors of [`MqttBroker::start`]; the broker is then stopped.
     fn restart(&mut self, fallback: SocketAddr) -> Result<SocketAddr, BrokerError> {
         let address = match self.health() {
             BrokerHealth::Serving(address) => address,
@@ -56,7 +59,7 @@ pub trait MqttBroker: Send {
     }
 }
 
-/// An error at the start of the embedded broker; nothing is left running.
+/// An error at the start of the embedded broker, which is then fully stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum BrokerError {
     /// It is already running.
@@ -84,39 +87,47 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
-    /// True if programs beside the node take part in the cell at its own `listen` address, whoever leads; default true.
-    /// Without, only nodes that may lead have a broker, and it is for nodes. Trade-off: a door costs some megabytes.
+    /// Whether local programs can connect to the cell at the node's own `listen` address,
+    /// independent of which node leads; default true. With false, only nodes that may lead have a
+    /// broker, and it is for nodes. Trade-off: a local broker costs some megabytes.
     pub door: bool,
-    /// Largest MQTT packet in bytes; default: as `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` need. A client that
-    /// sends a larger one is cut off. Trade-off: larger admits other programs' packets, smaller saves memory in attacks.
+    /// Largest MQTT packet in bytes; default: derived from `mqtt.max_map_bytes` and
+    /// `mqtt.max_payload_bytes`. A client that sends a larger one is cut off. Trade-off: a larger
+    /// value admits other programs' packets, a smaller one saves memory in attacks.
     pub max_packet_bytes: Option<u32>,
-    /// Maximum clients at a time; default 2048. Every client costs some kilobytes and a file descriptor.
+    /// Maximum number of simultaneous clients; default 2048. Every client costs some kilobytes and
+    /// a file descriptor.
     pub max_clients: usize,
-    /// Maximum clients at a time of one certificate, or of one remote address without certificates; default 32. A node
-    /// has one or two, and one for each observer. A cell behind address translation needs as many for each node.
+    /// Maximum number of simultaneous clients with one certificate or, without certificates, with
+    /// one remote address; default 32. A node has one or two, and one for each observer. A cell
+    /// behind address translation needs as many for each node.
     pub max_clients_each: usize,
-    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 2 MiB, the oldest gives way. More
-    /// carries a client over longer pauses, but what it then gets is old.
+    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 2 MiB,
+    /// the oldest is dropped. A higher value bridges longer pauses of a client, but the client then
+    /// gets old messages.
     pub max_waiting: usize,
-    /// Maximum topics with a retained message; default 8192: one for each node's status and one for the reputations.
+    /// Maximum topics with a retained message; default 8192: one for each node's status and one for
+    /// the reputations.
     pub max_retained: usize,
-    /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred bytes, reputations
-    /// some hundred for each vehicle. Messages beyond it are forwarded and not retained.
+    /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred
+    /// bytes, reputations some hundred for each vehicle. Messages beyond it are forwarded and not
+    /// retained.
     pub max_retained_bytes: usize,
-    /// True if the broker may listen on other than loopback addresses without `[tls]`; default false. Every host that
-    /// reaches it can then read everything and publish in any name.
+    /// True if the broker may listen on other than loopback addresses without `[tls]`; default
+    /// false. Every host that reaches it can then read everything and publish in any name.
     pub allow_plaintext: bool,
-    /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees places sooner, longer
-    /// admits slow boards and lossy networks.
+    /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees
+    /// places sooner, longer admits slow boards and lossy networks.
     pub handshake_timeout_ms: u64,
-    /// Burst of connections of one address; default 64. A cell behind address translation needs two or more for each
-    /// node.
+    /// Burst of connections of one address; default 64. A cell behind address translation needs two
+    /// or more for each node.
     pub connect_burst: u32,
     /// Connections per second of one address after the burst; default 10.
     pub connects_per_s: u32,
-    /// Maximum messages per second of one certificate; without certificates, of one address or local client; default
-    /// 1000. The same number is the burst. Further messages are dropped and counted. A node sends some tens per second.
-    /// Trade-off: more lets a flood take the others' time.
+    /// Maximum messages per second of one certificate; without certificates, of one address or
+    /// local client; default 1000. The same number is the burst. Further messages are dropped and
+    /// counted. A node sends some tens per second. Trade-off: a higher value lets a flood take the
+    /// processor time of other clients.
     pub max_messages_hz: u32,
 }
 
@@ -148,7 +159,7 @@ impl BrokerConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if let Some(bytes) = self.max_packet_bytes {
             check_range("max_packet_bytes", f64::from(bytes), 1024.0, 268_435_455.0)?;
@@ -197,8 +208,8 @@ struct RunningBroker {
 /// Largest packet in bytes without a configured limit: the default maps and their topics.
 const DEFAULT_PACKET_BYTES: u32 = 8 * 1024 * 1024 + 4096;
 
-/// Time for which a session outlives its connection; zero would mean no limit. A new connection starts empty: queues of
-/// absent clients would hold memory.
+/// Time for which a session outlives its connection; zero would mean no limit. A reconnecting
+/// client starts with an empty queue, because queues of absent clients would hold memory.
 const MAX_SESSION_EXPIRY: Duration = Duration::from_millis(1);
 
 /// Time for connections to end when the broker stops. Afterwards their tasks are abandoned.
@@ -228,7 +239,7 @@ impl EmbeddedBroker {
         }
     }
 
-    /// The same with a door for the node's programs.
+    /// The same broker, with a connection for the node's local programs.
     #[must_use]
     pub fn with_door(mut self, door: Door) -> Self {
         self.door = door;
@@ -322,7 +333,8 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-/// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the caller's async code.
+/// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the
+/// caller's async code.
 fn serve(
     address: SocketAddr,
     config: &BrokerConfig,
@@ -376,7 +388,7 @@ fn serve(
     runtime.shutdown_timeout(STOP_TIMEOUT);
 }
 
-/// Opens the sockets. rmqtt's own is public without a frontend, and else on loopback.
+/// Opens the sockets. rmqtt's own socket is public without a frontend, otherwise on loopback.
 async fn prepare(
     address: SocketAddr,
     config: &BrokerConfig,
@@ -390,7 +402,8 @@ async fn prepare(
 )> {
     let listener = Builder::new()
         .name("ecod")
-        // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
+        // Without it a restart would wait for the last connections' TIME_WAIT; a live listener
+        // still wins.
         .reuseaddr(Some(true))
         .nodelay(true)
         .max_packet_size(config.packet_bytes())
@@ -400,8 +413,9 @@ async fn prepare(
         .max_session_expiry_interval(MAX_SESSION_EXPIRY)
         .handshake_timeout(Duration::from_secs(5));
     let listener = match &policy {
-        // Without anonymous clients, rmqtt asks the hooks about each login.
-        // Subscriptions are limited by `SubscriptionQuota`: rmqtt would write a line of the log for each one that it refuses.
+        // With anonymous clients disabled, rmqtt calls the hooks for each login. Subscriptions are
+        // limited by `SubscriptionQuota`, because rmqtt would write a line of the log for each one
+        // that it refuses.
         Some(_) => listener
             .laddr((Ipv4Addr::LOCALHOST, 0).into())
             .allow_anonymous(false)
@@ -413,7 +427,8 @@ async fn prepare(
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;
-    // rmqtt's own overload check looks at the whole machine's load, which a vehicle's camera would exceed.
+    // rmqtt's own overload check uses the load of the whole machine, which a vehicle's camera would
+    // exceed.
     let context = ServerContext::new().busy_check_enable(false).build().await;
     *context.extends.retain_mut().await = Box::new(RetainedMessages::new(config));
     let (frontend, bound) = match &policy {

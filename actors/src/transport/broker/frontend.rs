@@ -5,8 +5,8 @@
 //!                    by source     certificate of the cell                within its principal's limits
 //! ```
 //!
-//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
-//! loopback port, and accepts only connections that the frontend has registered.
+//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore
+//! listens on a free loopback port, and accepts only connections that the frontend has registered.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::pin::Pin;
@@ -63,7 +63,7 @@ const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 /// Pause after `accept` failed, such as for lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 
-/// Time after which a client that reads nothing is cut off.
+/// Time after which a client that reads no bytes is cut off.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(15);
 
 impl BrokerFrontend {
@@ -115,7 +115,7 @@ impl BrokerFrontend {
         self.shared.limits.in_flight.clone()
     }
 
-    /// Accepts clients; never ends.
+    /// Accepts clients; does not return.
     pub(super) async fn run(self) {
         let mut rechecks = interval(RECHECK_INTERVAL);
         loop {
@@ -134,7 +134,7 @@ impl BrokerFrontend {
     }
 
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
-        // With certificates even local clients are told apart.
+        // With certificates even local clients can be distinguished.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
         let origin = if is_local {
             ClientOrigin::Local
@@ -169,7 +169,8 @@ impl BrokerFrontend {
         credentials.changed(&known).await;
     }
 
-    /// Has all connections checked again: when certificates or the revocation list changed, and periodically.
+    /// Makes all connections be checked again: when certificates or the revocation list changed,
+    /// and periodically.
     fn recheck(&self) {
         if let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) {
             sender.send_replace(credentials.current());
@@ -244,7 +245,7 @@ impl FrontendState {
 
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
-        // Registered before rmqtt can ask for it, and until the port may be reused.
+        // Registered before rmqtt queries it, and until the port may be reused.
         let _pass = self
             .principals
             .register(socket.local_addr()?, principal.clone());
@@ -276,7 +277,7 @@ async fn secure(
     Ok((Box::pin(stream), certificates))
 }
 
-/// Waits until the client's certificate is no longer valid; the result is the reason.
+/// Waits until the client's certificate becomes invalid; returns the reason.
 async fn certificate_invalidated(
     current: Option<watch::Receiver<Arc<LoadedCredentials>>>,
     certificates: &[CertificateDer<'static>],

@@ -18,8 +18,8 @@ pub(super) struct ThreadHeartbeat {
 /// Time between two beats, and minimum time between two checks that count.
 pub(super) const HEARTBEAT_INTERVAL: Duration = Duration::from_millis(200);
 
-/// Consecutive checks without a beat after which the thread hangs: some five seconds. Checks are counted instead of time,
-/// so that a stop of the whole process does not count.
+/// Consecutive checks without a beat after which the thread counts as hung: about five seconds.
+/// Checks are counted instead of time, so that a stall of the whole process does not count.
 const MAX_MISSED_CHECKS: u32 = 25;
 
 impl ThreadHeartbeat {

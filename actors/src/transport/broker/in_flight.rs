@@ -1,4 +1,5 @@
-//! Messages on their way through rmqtt, whose queues between a publisher and its subscribers have no bound.
+//! Messages in transit through rmqtt, whose queues between a publisher and its subscribers are
+//! unbounded.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,8 +11,9 @@ use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 
 use super::principal::PrincipalRegistry;
 
-/// Bytes on their way through rmqtt by principal of the publisher. Each payload carries its charge until the last queue
-/// has let go of it. While there are too many, the frontend takes nothing more of the publisher.
+/// Bytes in transit through rmqtt, by principal of the publisher. Each payload carries its charge
+/// until the last queue has released it. While there are too many bytes, the frontend reads no more
+/// from the publisher.
 #[derive(Debug, Clone, Default)]
 pub(super) struct InFlight(Arc<Mutex<Charges>>);
 
@@ -21,7 +23,8 @@ struct Charges {
     total: usize,
 }
 
-/// Bytes in flight beyond which a principal, one with a large share, and all wait.
+/// Bytes in transit beyond which a principal, a principal with a large share, or all principals
+/// have to wait.
 const MAX_BYTES_EACH: usize = 1024 * 1024;
 const MAX_BYTES_LARGE: usize = 8 * 1024 * 1024;
 const MAX_BYTES: usize = 32 * 1024 * 1024;
@@ -101,7 +104,7 @@ pub(super) struct InFlightMeter {
 }
 
 impl InFlightMeter {
-    /// Registers the hook for every message, before the door's.
+    /// Registers the hook for every message, before the hooks of the local broker.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         register

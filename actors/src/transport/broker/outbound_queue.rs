@@ -1,10 +1,11 @@
-//! Bytes for a client that takes them more slowly than they come.
+//! Bytes for a client that reads more slowly than they arrive.
 
 use std::collections::VecDeque;
 
 use super::packet_scanner::{PacketScanner, Piece};
 
-/// Packets for one client, in order. Where there are too many, the oldest message gives way: a late map is worth nothing.
+/// Packets for one client, in order. If there are too many, the oldest message is dropped: a late
+/// map is worthless.
 #[derive(Debug)]
 pub(super) struct OutboundQueue {
     bytes: VecDeque<u8>,
@@ -21,10 +22,12 @@ struct QueuedPacket {
     is_droppable: bool,
 }
 
-/// Messages of one client beyond this many bytes give way, but for the newest.
+/// Maximum bytes of messages of one client; beyond it the oldest messages are dropped, but the
+/// newest one is kept.
 const MAX_BYTES: usize = 2 * 1024 * 1024;
 
-/// Packets that must not be dropped and may wait beside the messages.
+/// Maximum number of packets that must not be dropped and may be queued in addition to the
+/// messages.
 const MAX_ANSWERS: usize = 64;
 
 /// Memory that an empty queue keeps.
@@ -39,7 +42,7 @@ const RETAIN: u8 = 0x01;
 pub(super) struct QueueFull;
 
 impl OutboundQueue {
-    /// An empty queue of at most so many messages.
+    /// An empty queue for at most `max_packets` messages.
     pub(super) fn new(max_packets: usize) -> Self {
         Self {
             bytes: VecDeque::new(),
@@ -89,7 +92,8 @@ impl OutboundQueue {
         Ok(dropped)
     }
 
-    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold twice their bytes.
+    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold
+    /// twice their bytes.
     fn append(&mut self, more: &[u8]) {
         let length = self.bytes.len() + more.len();
         if length > self.bytes.capacity() && length > KEPT_BYTES {
@@ -98,7 +102,8 @@ impl OutboundQueue {
         self.bytes.extend(more);
     }
 
-    /// Drops the oldest message that may be dropped; never the newest packet, whose end may be still to come.
+    /// Drops the oldest message that may be dropped. The newest packet is kept, because its end may
+    /// be still to come.
     fn drop_oldest(&mut self) -> bool {
         let mut before = 0;
         let older = self

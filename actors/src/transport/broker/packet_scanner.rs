@@ -3,7 +3,7 @@
 /// Finds where packets begin and end.
 #[derive(Debug, Default)]
 pub(super) struct PacketScanner {
-    /// The fixed header as far as it has come.
+    /// The part of the fixed header that has arrived.
     header: Vec<u8>,
     /// Bytes of the present packet that are still to come.
     rest: usize,
@@ -22,8 +22,8 @@ pub(super) enum Piece<'a> {
 const MAX_HEADER_BYTES: usize = 5;
 
 impl PacketScanner {
-    /// Takes the next piece off the bytes; none when all are taken. A header without an end counts as an empty packet,
-    /// which ends the connection at its receiver.
+    /// Takes the next piece off the bytes; `None` when all are taken. A header without an end
+    /// counts as an empty packet, which ends the connection at its receiver.
     pub(super) fn next<'a>(&mut self, bytes: &mut &'a [u8]) -> Option<Piece<'a>> {
         if self.rest > 0 && !bytes.is_empty() {
             let (body, after) = bytes.split_at(self.rest.min(bytes.len()));

@@ -3,14 +3,15 @@
 //! | topic | may publish |
 //! |---|---|
 //! | `detections/N`, `detections/N--…`, `vote_detections/N`, `vote_detections/N--…` | the certificate of `N` |
-//! | `ledger/N` | the same, if `N` may lead |
+//! | `ledger/N` | the certificate of `N`, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
-//! | `cell` | nodes that may lead; receivers check who has set it |
+//! | `cell` | nodes that may lead; receivers check which node set it |
 //! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
-//! | anything else | nobody |
+//! | anything else | no client |
 //!
-//! Only statuses, reputations and the cell's description may be retained: other messages are worthless when late. Everyone with a certificate
-//! of the cell may read everything. Topics and filters are bounded in length and in levels.
+//! Only statuses, reputations and the cell's description may be retained: other messages are
+//! worthless when late. Every client with a certificate of the cell may read all topics. Topics and
+//! filters are bounded in length and in levels.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -35,7 +36,8 @@ use crate::transport::pki::{CertificateSubject, Credentials};
 /// Rules of access to an embedded broker.
 #[derive(Clone)]
 pub struct AccessPolicy {
-    /// The node's certificates. Without them every client may log in and publish anything, within limits.
+    /// The node's certificates. Without them every client may log in and publish anything, within
+    /// limits.
     pub credentials: Option<Arc<Credentials>>,
     /// The cell's topics.
     pub topics: Topics,
@@ -98,7 +100,7 @@ impl Permissions {
         principal.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
     }
 
-    /// Takes a message, or says why not.
+    /// Accepts a message, or returns the reason for refusing it.
     fn check_publish(&self, session: &Session, publish: &Publish) -> Result<(), DoorRefusal> {
         let (place, topic) = TopicPlace::of(&publish.topic);
         let refused =
@@ -117,8 +119,8 @@ impl Permissions {
         is_allowed.then_some(()).ok_or_else(refused)
     }
 
-    /// True if a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
-    /// and retention.
+    /// True if a principal may publish on a topic. Without certificates every topic is allowed,
+    /// within its limits of size and retention.
     fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
         let may_publish = |identity: &Arc<CertificateSubject>| {
             let topic = self.policy.topics.parse(topic);
@@ -180,10 +182,12 @@ impl Permissions {
     }
 }
 
-/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its
+/// stack.
 pub(super) const MAX_TOPIC_LEVELS: usize = 32;
 
-/// Maximum payload of a status in bytes. One has some hundred; they are retained, and sent to each new subscriber.
+/// Maximum payload of a status in bytes. A typical status has some hundred; statuses are retained,
+/// and sent to each new subscriber.
 const MAX_STATUS_BYTES: usize = 16 * 1024;
 
 /// Maximum length of a topic or filter in bytes.
@@ -224,11 +228,12 @@ impl Handler for Permissions {
                     SubscribeAckReason::TopicFilterInvalid,
                 ))
             }
-            // QoS 0: an acknowledgement that never comes would hold messages in memory.
+            // QoS 0: an acknowledgement that is never sent would hold messages in memory.
             Parameter::ClientSubscribeCheckAcl(..) => HookResult::SubscribeAclResult(
                 SubscribeAclResult::new_success(QoS::AtMostOnce, None),
             ),
-            // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
+            // An UNSUBACK cannot refuse. Such a filter is not subscribed in the first place, so
+            // there is no subscription to end.
             Parameter::ClientUnsubscribe(session, unsubscribe)
                 if !is_topic_bounded(&unsubscribe.topic_filter) =>
             {
@@ -272,8 +277,8 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
     }
 }
 
-/// True if a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
-/// same client id, so that foreign ids are refused.
+/// True if a client id is the name and run of this node or of its observer. A connection ends an
+/// earlier one with the same client id, so client ids of other nodes are refused.
 fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
     client_id
         .rsplit_once('-')

@@ -16,20 +16,21 @@ use crate::transport::pki::CertificateSubject;
 /// Decides whether a node may publish maps, verdicts and reputations.
 pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 
-/// Authenticated party of a connection: a node by its certificate, or else a host by its address. Programs beside a node
-/// share its certificate or address, and are a party of their own: what they use up, the node does not lack.
+/// Authenticated party of a connection: a node by its certificate, or a host by its address. Local
+/// programs share their node's certificate or address, and are a separate party: their use of a
+/// quota does not reduce the node's quota.
 #[derive(Debug, Clone)]
 pub(super) struct Principal {
     /// Absent without certificates.
     pub(super) identity: Option<Arc<CertificateSubject>>,
-    /// Key under which its connections and messages count together. Absent for local clients without certificates: a
-    /// whole cell may run on this machine.
+    /// Key under which its connections and messages count together. Absent for local clients
+    /// without certificates: a whole cell may run on this machine.
     quota_key: Option<Arc<str>>,
     /// Name under which its bytes count together, also for local clients.
     source: Arc<str>,
-    /// True if the broker draws the client id.
+    /// True if the broker generates the client id.
     pub(super) has_generated_id: bool,
-    /// True if it is the programs beside the broker's node.
+    /// True if the party is the local programs of the broker's node.
     are_programs: bool,
 }
 
@@ -54,7 +55,7 @@ impl Principal {
         }
     }
 
-    /// The programs of this party, whose connections, messages and bytes count apart.
+    /// The programs of this party, whose connections, messages and bytes count separately.
     pub(super) fn programs(self) -> Self {
         let apart = |key: &Arc<str>| Arc::from(format!("{key}, programs"));
         let (quota_key, source) = (self.quota_key.as_ref().map(apart), apart(&self.source));
@@ -66,7 +67,8 @@ impl Principal {
         }
     }
 
-    /// True if it is the node itself by its certificate; without certificates, a client of this machine.
+    /// True if it is the node itself by its certificate; without certificates, a client of this
+    /// machine.
     pub(super) fn is_of(&self, node: &NodeName) -> bool {
         self.identity
             .as_ref()
@@ -78,7 +80,7 @@ impl Principal {
         &self.source
     }
 
-    /// Name under which held bytes count together; none where each connection counts alone.
+    /// Name under which held bytes count together; `None` if each connection counts separately.
     pub(super) fn quota_key(&self) -> Option<Arc<str>> {
         self.quota_key.clone()
     }
@@ -94,7 +96,7 @@ impl Principal {
     }
 }
 
-/// True if the end of a client id is that of a node's run.
+/// True if the end of a client id has the form of a node's run.
 pub(super) fn is_run(text: &str) -> bool {
     text.len() == 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
@@ -176,7 +178,8 @@ impl PrincipalRegistry {
         );
     }
 
-    /// Notes that a connection has begun or ended a subscription. One that is made again counts once.
+    /// Records that a connection has started or ended a subscription. A repeated subscription
+    /// counts once.
     pub(super) fn note_subscription(
         &self,
         address: Option<SocketAddr>,
@@ -194,7 +197,8 @@ impl PrincipalRegistry {
         }
     }
 
-    /// Subscriptions of all connections of the same principal, or of this connection where each counts alone.
+    /// Number of subscriptions of all connections of the same principal, or of this connection if
+    /// each counts separately.
     pub(super) fn subscriptions(&self, address: Option<SocketAddr>) -> usize {
         let connections = self.connections();
         let Some(connection) = address.and_then(|address| connections.get(&address)) else {
@@ -239,7 +243,7 @@ pub(super) struct ConnectionQuota {
     connections: Mutex<HashMap<Arc<str>, Arc<Semaphore>>>,
 }
 
-/// The place of one connection, free when dropped. Connections that do not count hold none.
+/// The place of one connection, free when dropped; `None` for connections that don't count.
 pub(super) type ConnectionPermit = Option<OwnedSemaphorePermit>;
 
 impl ConnectionQuota {

@@ -21,7 +21,7 @@ use super::subscriptions::MAX_SUBSCRIPTIONS;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, ShedReason};
 
-/// Limits of what passes between clients and rmqtt.
+/// Limits of the traffic between clients and rmqtt.
 pub(super) struct RelayLimits {
     pub(super) backlog: Backlog,
     pub(super) throttle: ByteThrottle,
@@ -35,12 +35,13 @@ pub(super) struct RelayLimits {
 /// Time to deliver the rest to a client that has ended its side.
 const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Time between two looks whether rmqtt has passed on enough to take more.
+/// Time between two checks whether rmqtt has forwarded enough to accept more.
 const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
 
 const BUFFER_BYTES: usize = 8 * 1024;
 
-/// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its filters at once.
+/// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its
+/// filters at once.
 const MAX_FILTERS_BYTES: usize = MAX_SUBSCRIPTIONS * 256;
 
 /// Packet types, in the upper half of the first byte.
@@ -48,11 +49,12 @@ const SUBSCRIBE: u8 = 8;
 const UNSUBSCRIBE: u8 = 10;
 
 impl RelayLimits {
-    /// Forwards bytes until either side ends or the client exceeds its limits. `wire_bytes` are those that the client has
-    /// sent, where they are more than its stream gives.
+    /// Forwards bytes until either side ends or the client exceeds its limits. `wire_bytes` counts
+    /// the bytes that the client has sent, if they are more than its stream returns.
     ///
     /// # Errors
-    /// [`ClientRejection::Stalled`] or [`ClientRejection::Malformed`]; a connection that is lost otherwise has just ended.
+    /// Returns [`ClientRejection::Stalled`] or [`ClientRejection::Malformed`]; a connection that is
+    /// lost otherwise counts as ended.
     pub(super) async fn relay(
         &self,
         client: impl AsyncRead + AsyncWrite,
@@ -147,7 +149,8 @@ impl RelayLimits {
         }
     }
 
-    /// Takes all that rmqtt sends, so that nothing waits there, and passes it on as the client reads it.
+    /// Reads all that rmqtt sends, so that bytes are not queued there, and forwards it at the
+    /// client's reading speed.
     async fn forward_down(
         &self,
         mut broker: impl AsyncRead + Unpin,
@@ -193,7 +196,7 @@ fn has_too_many_filters(header: &[u8], length: usize) -> bool {
         && length > MAX_FILTERS_BYTES
 }
 
-/// Sends some bytes, or, if there are none, those that TLS still holds.
+/// Sends some bytes or, if there are none, the bytes that TLS still holds.
 async fn send(client: &mut (impl AsyncWrite + Unpin), bytes: &[u8]) -> io::Result<usize> {
     if bytes.is_empty() {
         client.flush().await.map(|()| 0)
@@ -202,7 +205,7 @@ async fn send(client: &mut (impl AsyncWrite + Unpin), bytes: &[u8]) -> io::Resul
     }
 }
 
-/// The end of a client that does not take what it gets, or does not end what it begins.
+/// The error for a client that does not read its messages, or does not complete its packets.
 fn stalled() -> io::Error {
     io::ErrorKind::TimedOut.into()
 }

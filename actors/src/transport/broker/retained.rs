@@ -45,8 +45,8 @@ impl RetainStorage for RetainedMessages {
         false
     }
 
-    // `_listener_expiry` is for queued messages. A retained status is valid until it is replaced, or until the expiry
-    // that its publisher set (MQTT 5).
+    // `_listener_expiry` is for queued messages. A retained status is valid until it is replaced,
+    // or until the expiry that its publisher set (MQTT 5).
     async fn set(
         &self,
         topic: &TopicName,

@@ -1,4 +1,5 @@
-//! Subscriptions of each principal: how many, and how often. Each new one is answered with all retained messages.
+//! Subscriptions of each principal: their number and rate. Each new one is answered with all
+//! retained messages.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;

@@ -1,4 +1,5 @@
-//! MQTT over WebSocket (MQTT 5, section 6): the same port, told apart by the first byte of a client.
+//! MQTT over WebSocket (MQTT 5, section 6) on the same port; the first byte of a client
+//! distinguishes the protocols.
 
 use std::io::{self, Cursor, ErrorKind};
 use std::net::IpAddr;
@@ -22,31 +23,33 @@ use tokio_util::io::InspectReader;
 
 use super::client_rejection::ClientRejection;
 
-/// First byte of an HTTP request. No MQTT client begins so.
+/// First byte of an HTTP request. MQTT clients start with a different byte.
 pub(super) const FIRST_BYTE: u8 = b'G';
 
 /// Maximum bytes of an HTTP request, and of the buffer that reads it.
 const MAX_REQUEST_BYTES: u64 = 16 * 1024;
 const REQUEST_BUFFER_BYTES: usize = 1024;
 
-/// Answer to a browser that asks for a page (RFC 9110, section 15.5.22).
+/// Answer to a browser that requests a page (RFC 9110, section 15.5.22).
 const NO_PAGE: &str = "no page is here: programs speak MQTT at this port, and pages MQTT over WebSocket. The node's own page is at \
                        `dashboard.listen`, http://127.0.0.1:8080/ by default\n";
 
-/// Maximum bytes of one WebSocket message: it is held until it is complete. An MQTT packet may be spread over several.
+/// Maximum bytes of one WebSocket message: it is held until it is complete. An MQTT packet may be
+/// spread over several.
 const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 
 /// Maximum bytes of a message to the client, and of the buffers in each direction.
 const CHUNK_BYTES: usize = 8 * 1024;
 
-/// Maximum bytes of frames without content in a row, among them pings of a client that says nothing else for days.
+/// Maximum bytes of consecutive frames without content, which include the pings of a client that is
+/// otherwise silent for days.
 const MAX_EMPTY_BYTES: usize = 2 * MAX_MESSAGE_BYTES;
 
 /// The bytes of MQTT within a WebSocket.
 pub(super) struct WebSocketBytes<S> {
     socket: WebSocketStream<S>,
     received: Bytes,
-    /// A client's fault that is told once what came before it was read.
+    /// A client's fault that is reported once the preceding bytes have been read.
     fault: Option<io::Error>,
     /// All bytes from the client.
     wire_bytes: Arc<AtomicUsize>,
@@ -54,7 +57,8 @@ pub(super) struct WebSocketBytes<S> {
     content_at: usize,
 }
 
-/// Answers the handshake of a client whose first byte was taken. All bytes that it sends are added to `wire_bytes`.
+/// Answers the handshake of a client whose first byte was taken. All bytes that it sends are added
+/// to `wire_bytes`.
 pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
     stream: S,
     wire_bytes: Arc<AtomicUsize>,
@@ -153,8 +157,8 @@ fn answer(request: &Request, mut response: Response) -> Result<Response, ErrorRe
     Ok(response)
 }
 
-/// Checks the page that connects. A browser lets the page of any site connect to any address, also on loopback, and
-/// names the site. Programs name none.
+/// Checks the origin of the connecting page. A browser lets the page of any site connect to any
+/// address, including loopback, and sends the site's name. Programs don't send one.
 fn check_page(headers: &HeaderMap) -> Result<(), String> {
     let Some(origin) = headers.get(ORIGIN) else {
         return Ok(());
@@ -171,7 +175,8 @@ fn check_page(headers: &HeaderMap) -> Result<(), String> {
             .and_then(|value| value.to_str().ok())
             .and_then(host)
     };
-    // The name of a foreign site can be made to lead here (DNS rebinding); an address or this machine's name cannot.
+    // The name of another site can be made to resolve to this address (DNS rebinding); an address
+    // or this machine's name cannot.
     let is_own = page.is_some() && page == text(HOST) && page.as_deref().is_some_and(is_safe_name);
     if is_own {
         return Ok(());
@@ -228,7 +233,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocketBytes<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocketBytes<S> {
-    /// Fills the buffer from as many messages as have come, so that small ones cost no more than on TCP.
+    /// Fills the buffer from all messages that have arrived, so that small ones cost no more than
+    /// on TCP.
     fn poll_read(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -266,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocketBytes<S> {
         cx: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
-        // What a client does not read waits outside, where it is limited.
+        // Bytes that a client has not read wait in the outer queue, where they are limited.
         ready!(Pin::new(&mut self.socket).poll_ready(cx)).map_err(io_error)?;
         let chunk = Bytes::copy_from_slice(bytes.get(..CHUNK_BYTES).unwrap_or(bytes));
         let written = chunk.len();
@@ -292,7 +298,8 @@ fn io_error(error: Error) -> io::Error {
     }
 }
 
-/// The content of what a client sends after its first byte, if its handshake is accepted. Only built for the fuzz targets.
+/// The content that a client sends after its first byte, if its handshake is accepted. Only built
+/// for the fuzz targets.
 #[cfg(fuzzing)]
 pub fn read_websocket(sent: Vec<u8>) -> Option<Vec<u8>> {
     use futures_util::FutureExt;

@@ -9,50 +9,55 @@ use serde::{Deserialize, Serialize};
 
 use crate::platform::secret::Secret;
 
-/// UDP port on which a node gossips unless told otherwise.
+/// Default UDP port for gossip.
 pub const DEFAULT_PORT: u16 = 17_884;
 
-/// Gossip address, discovery and timings of failure detection; `[membership]` in the configuration file.
+/// Gossip address, discovery and timings of failure detection; `[membership]` in the configuration
+/// file.
 ///
 /// Key, multicast group and timings must be the same on every node of a cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MembershipConfig {
-    /// The cell's key: 64 hexadecimal digits (best, such as from `openssl rand -hex 32`), or a passphrase of at least
-    /// 12 characters. Default none: anyone can take part, and the node gossips on loopback only unless `bind` is set.
-    /// Never printed.
+    /// The cell's key: 64 hexadecimal digits (recommended, for example from
+    /// `openssl rand -hex 32`), or a passphrase of at least 12 characters. Default: not set; any
+    /// host can then join, and the node gossips on loopback only unless `bind` is set. It is not
+    /// printed.
     pub key: Option<Secret>,
-    /// A file with the key; white space around it is ignored. Default none. Excludes `key`.
+    /// A file with the key; white space around it is ignored. Default: not set. Excludes `key`.
     pub key_file: Option<PathBuf>,
-    /// Address and UDP port to gossip on; port 0 takes any free one. Default port 17884, or a free one if another node
-    /// of this machine has it, on all interfaces with a key and on 127.0.0.1 without. With an IPv6 address all of the
-    /// cell gossips by IPv6, and finds each other by `seeds` only; link-local ones (`fe80::`) do not do.
+    /// Address and UDP port for gossip; port 0 takes any free one. Default port 17884, or a free
+    /// one if another node of this machine uses it, on all interfaces with a key and on 127.0.0.1
+    /// without. With an IPv6 address the whole cell gossips by IPv6, and nodes find each other by
+    /// `seeds` only; link-local addresses (`fe80::`) don't work.
     pub bind: Option<SocketAddr>,
-    /// Address at which others reach this node, if address translation hides it. Default none: that of `bind`, or what
-    /// others see.
+    /// Address at which other nodes reach this node, if address translation hides it. Default: not
+    /// set; the address of `bind`, or the address that other nodes observe.
     pub advertise: Option<SocketAddr>,
-    /// Nodes as `host:port` that are asked for the cell, besides multicast; resolved anew and asked for ever. Default
-    /// none. Not all need to be there, nor need they be the same on every node.
+    /// Nodes as `host:port` through which this node finds the cell, in addition to multicast; they
+    /// are resolved and contacted repeatedly, without a time limit. Default: empty. Seeds may be
+    /// absent, and may differ between nodes.
     pub seeds: Vec<String>,
     /// Discovery by multicast.
     pub multicast: MulticastConfig,
-    /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects failures sooner and costs
-    /// packets.
+    /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects
+    /// failures sooner and costs packets.
     pub probe_ms: u64,
-    /// Time within which a probed node must answer before others are asked to probe it, in ms. Default 30; must be less
-    /// than half of `probe_ms`. Longer suits slower networks.
+    /// Time within which a probed node must answer before other nodes probe it on this node's
+    /// behalf, in ms. Default 30; must be less than half of `probe_ms`. A longer time suits slower
+    /// networks.
     pub reply_ms: u64,
-    /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off: longer declares fewer
-    /// living nodes down and detects failures later.
+    /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off:
+    /// longer declares fewer living nodes down and detects failures later.
     pub suspect_ms: u64,
-    /// Time between two rounds of gossip, in ms. Default 50; nothing is sent without news.
+    /// Time between two rounds of gossip, in ms. Default 50; rounds without news send no packets.
     pub gossip_ms: u64,
-    /// Time between two greetings, in ms, to every absent seed and to the multicast group. Once other nodes are alive,
-    /// the group is greeted a tenth as often. Default 500, and at most half of the election's `join_ms`: a returning
-    /// seed must hear of its cell before it leads on its own. Trade-off: shorter heals split cells sooner and costs
-    /// packets.
+    /// Time between two greetings, in ms, to every absent seed and to the multicast group. Once
+    /// other nodes are alive, the group is greeted a tenth as often. Default 500, and at most half
+    /// of the election's `join_ms`: a returning seed must discover its cell before it leads on its
+    /// own. Trade-off: a shorter time heals split cells sooner and costs packets.
     pub hello_ms: u64,
-    /// Maximum known nodes. Default 256.
+    /// Maximum number of other nodes. Default 256.
     pub max_peers: usize,
 }
 
@@ -60,13 +65,14 @@ pub struct MembershipConfig {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MulticastConfig {
-    /// True if to greet and listen to greetings. Default true.
+    /// Whether to send greetings and listen to them. Default true.
     pub enabled: bool,
     /// The group. Default 239.255.36.84, of the range that routers keep local.
     pub group: Ipv4Addr,
     /// UDP port of the group. Default 17885. All nodes of a machine share it.
     pub port: u16,
-    /// Address of the network interface to use. Default that of `bind`, or else what the system chooses.
+    /// Address of the network interface to use. Default: the address of `bind`, otherwise the
+    /// system's choice.
     pub interface: Option<Ipv4Addr>,
 }
 
@@ -104,7 +110,7 @@ impl MembershipConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first key that cannot be used.
+    /// Returns a [`ConfigError`] that names the first key that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.key.is_some() && self.key_file.is_some() {
             return Err(ConfigError::new(

@@ -13,7 +13,7 @@ pub enum FrameEvent {
     Sent,
     /// Not sent: the socket or the network refused it.
     SendFailed,
-    /// Not sent: the addressee is not known, or not yet.
+    /// Not sent: there is no session with the addressee, or not yet.
     NoSession,
     /// Received from any address.
     Received,
@@ -27,13 +27,15 @@ pub enum FrameEvent {
     BadSeal,
     /// Of a node without certificate in a cell that has them, or the reverse.
     Uncertified,
-    /// A proof of a certificate that is not one of the cell, not valid, revoked, of another name or not by its owner.
+    /// The proof of a certificate that is of another cell, invalid, revoked, of another name or not
+    /// signed by its owner.
     Untrusted,
     /// A session ended: its certificate was revoked or has expired.
     Expelled,
     /// Received before, too late, or an answer without a recent request.
     Replayed,
-    /// Its counter is too far ahead of the last one. Nobody sends that many frames unheard: starts a handshake.
+    /// Its counter is too far ahead of the last one, because a sender stops long before so many
+    /// unanswered frames: starts a handshake.
     CounterJump,
     /// Authentic, from a session that is not established: starts a handshake.
     Unestablished,

@@ -5,8 +5,8 @@
 //! | ec 0d | version | kind | cell | sender's session | counter | sealed body ... | seal (16) |
 //! ```
 //!
-//! All integers are big-endian. The seal is ChaCha20-Poly1305 with the head as associated data, the counter as nonce,
-//! and a key of its own for every pair of sessions and direction.
+//! All integers are big-endian. The seal is ChaCha20-Poly1305 with the head as associated data, the
+//! counter as nonce, and a key of its own for every pair of sessions and direction.
 
 use std::net::SocketAddr;
 
@@ -27,7 +27,8 @@ pub(crate) const MAX_FRAME_BYTES: usize = HEADER_BYTES + MAX_PAYLOAD_BYTES + SEA
 const SEAL_BYTES: usize = 16;
 const MAGIC: [u8; 2] = [0xec, 0x0d];
 
-/// Version of a frame. A cell has one: nodes with certificates and nodes without do not admit each other.
+/// Version of a frame. A cell has one: nodes with certificates and nodes without do not admit each
+/// other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Version {
     /// Sessions prove the cell's key.
@@ -49,8 +50,9 @@ pub(crate) enum FrameKind {
     Payload = 4,
 }
 
-/// A step of the handshake. In a cell with certificates an [`Attestation`](super::handshake::Attestation) follows each
-/// proof and accept. Each side proves that it is reachable now by returning the other's cookie:
+/// A step of the handshake. In a cell with certificates an
+/// [`Attestation`](super::handshake::Attestation) follows each proof and accept. Each side proves
+/// that it is reachable now by returning the other's cookie:
 ///
 /// ```text
 /// A ── Hello ─────────────────────────────────────▶ all, or a seed
@@ -60,14 +62,14 @@ pub(crate) enum FrameKind {
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Handshake {
-    /// Asks the greeter to prove that it is reachable.
+    /// Asks the greeting node to prove that it is reachable.
     Challenge {
         /// Cookie to be returned.
         cookie: Cookie,
         /// Name of the challenger.
         name: NodeName,
     },
-    /// Proves it, and asks the same of the challenger.
+    /// Proves reachability, and requests the same proof from the challenger.
     Proof {
         /// The challenger's cookie.
         echo: Cookie,
@@ -90,9 +92,9 @@ pub(crate) enum Handshake {
 pub(crate) struct Introduction {
     /// The sender.
     pub(crate) id: NodeId,
-    /// Address at which the sender sees the receiver.
+    /// Address from which the receiver's packets reach the sender.
     pub(crate) seen_at: SocketAddr,
-    /// Other claims to the receiver's name that the sender knows.
+    /// Other claims to the receiver's name that the sender has received.
     pub(crate) claim: NameClaim,
 }
 
@@ -117,7 +119,8 @@ pub(crate) struct Hello {
 /// More about a greeting.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Greeting {
-    /// True if the sender asks for a new session: it lost the one there was, or hears nothing in it.
+    /// True if the sender needs a new session: it lost the previous one, or receives no frames in
+    /// it.
     pub(crate) wants_session: bool,
 }
 
@@ -131,7 +134,7 @@ pub(crate) struct FrameHeader {
 }
 
 impl FrameHeader {
-    /// Reads the head of a frame; its body is what follows the head.
+    /// Reads the head of a frame; the body follows the head.
     pub(crate) fn read(frame: &[u8], cell: [u8; 4]) -> Result<Self, FrameEvent> {
         if frame.len() > MAX_FRAME_BYTES {
             return Err(FrameEvent::Oversized);

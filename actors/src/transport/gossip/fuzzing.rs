@@ -21,7 +21,7 @@ use super::node_id::NodeId;
 use super::sessions::{decode, decode_first, encode};
 use super::trial_authority::TrialAuthority;
 
-/// Time at which all begins, in microseconds since 1970.
+/// Start time, in microseconds since 1970.
 const START: u64 = 1_700_000_000_000_000;
 
 const OWN: &str = "own";
@@ -38,24 +38,25 @@ static IDENTITIES: LazyLock<[Identity; 2]> = LazyLock::new(|| {
 /// Changes of single bytes: place, modulo the length, and bits to turn over.
 pub type Edits = Vec<(u16, u8)>;
 
-/// A node that hears a peer, whose frames can say anything.
+/// A node that receives frames with arbitrary content from a peer.
 pub struct Listener {
     own: GossipMachine,
     key: CellKey,
     version: Version,
     sessions: [SessionId; 2],
     now: Timestamp,
-    /// Frames of the peer that were forged; beyond those that it sent itself.
+    /// Number of the peer's frames that were forged, in addition to the frames that it sent itself.
     forged: u64,
     /// The peer's certificate and key, in a cell with certificates.
     prover: Option<Prover>,
     /// The last cookie that the node sent the peer in a challenge.
     challenge: Option<Cookie>,
-    /// The node's last proof to the peer: its cookie, and the transcript that an accept is bound to.
+    /// The node's last proof to the peer: its cookie, and the transcript that an accept is bound
+    /// to.
     proof: Option<(Cookie, Transcript)>,
 }
 
-/// Cookie of the peer's challenges. The peer believes any answer.
+/// Cookie of the peer's challenges. The peer accepts any answer.
 const PEER_COOKIE: Cookie = [8; 16];
 
 impl Listener {
@@ -95,7 +96,7 @@ impl Listener {
         listener
     }
 
-    /// A node that has met nobody yet.
+    /// A node that has not received any other node yet.
     pub fn alone(proves: bool) -> Self {
         let now = Timestamp(START);
         let own = machine(OWN, 2, proves, now);
@@ -132,7 +133,8 @@ impl Listener {
         self.settle();
     }
 
-    /// Processes a body sealed by the cell's key in the peer's session, or as a frame of a cell of the other kind.
+    /// Processes a body sealed by the cell's key in the peer's session, or as a frame of a cell
+    /// with the other version.
     pub fn hear_sealed(&mut self, kind: u8, body: &[u8]) {
         let [own, peer] = self.sessions;
         let (kind, to, version) = match kind % 5 {
@@ -153,7 +155,8 @@ impl Listener {
         self.hear(&frame);
     }
 
-    /// Processes a greeting of the peer, which answers it with a challenge unless it knows the peer.
+    /// Processes a greeting of the peer, which the node answers with a challenge unless it has a
+    /// session with the peer.
     pub fn hear_greeting(&mut self, wants_session: bool) {
         let mut body = encode(&Hello { name: name(PEER) });
         if self.prover.is_some() {
@@ -171,8 +174,8 @@ impl Listener {
         self.hear_sealed(1, &edited(challenge, edits));
     }
 
-    /// Processes the peer's proof with the node's last cookie. The peer signs what was made of its message; then the
-    /// attestation is changed.
+    /// Processes the peer's proof with the node's last cookie. The peer signs the edited message;
+    /// then the attestation is edited.
     pub fn hear_proof(&mut self, message: &Edits, attestation: &Edits) {
         let Some(echo) = self.challenge else { return };
         let proof = Handshake::Proof {
@@ -242,7 +245,8 @@ impl Listener {
         self.settle();
     }
 
-    /// Asserts that a node of a cell with certificates knows its peer only, whatever it heard.
+    /// Asserts that a node of a cell with certificates has only its peer as a member, after any
+    /// received frames.
     pub fn assert_nobody_else(&self) {
         let strangers = self
             .own
@@ -260,7 +264,8 @@ impl Listener {
         }
     }
 
-    /// Keeps from the node's handshakes with the peer as much as the peer needs for its next step.
+    /// Stores the data from the node's handshakes with the peer that the peer needs for its next
+    /// step.
     fn note_handshake(&mut self, frame: &[u8]) -> Option<()> {
         let [own, peer] = self.sessions;
         let head = FrameHeader::read(frame, self.key.tag()).ok()?;
@@ -302,7 +307,7 @@ fn edited(mut bytes: Vec<u8>, edits: &Edits) -> Vec<u8> {
     bytes
 }
 
-/// The peer as it introduces itself.
+/// The introduction of the peer.
 fn introduction() -> Introduction {
     Introduction {
         id: node_id(PEER, Timestamp(START)),

@@ -1,8 +1,9 @@
-//! Proof of certificates in the handshake: transcripts, signatures, and the keys that come of it.
+//! Proof of certificates in the handshake: transcripts, signatures, and the resulting keys.
 //!
-//! The prover signs with its proof, the accepter with its accept. Each names in its transcript both sessions, both
-//! cookies and its own ephemeral key; the accepter's transcript includes the prover's. The frame keys depend on the
-//! accepter's transcript. So two nodes with the same keys agree on everything in it, and on each other's certificate.
+//! The prover signs with its proof, the accepter with its accept. The transcript of each contains
+//! both sessions, both cookies and its own ephemeral key; the accepter's transcript also includes
+//! the prover's. The frame keys depend on the accepter's transcript. Two nodes with the same keys
+//! therefore agree on everything in it, and on each other's certificate.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
@@ -29,7 +30,7 @@ use super::session_keys::KeySet;
 use crate::platform::throttle::host_network;
 use crate::transport::pki::{CertificateSubject, Distrust, LoadedCredentials, is_signed_by};
 
-/// Certificates of this node, and the time at which others' are verified.
+/// Certificates of this node, and the time at which other nodes' certificates are verified.
 #[derive(Clone)]
 pub(crate) struct Identity {
     pub(crate) credentials: Arc<LoadedCredentials>,
@@ -42,7 +43,8 @@ pub(crate) struct Identity {
 pub(crate) struct Attestation {
     /// Public X25519 key for this handshake.
     pub(crate) ephemeral: [u8; 32],
-    /// With the name, the preimage of the sender's session: nobody takes the session of another name.
+    /// With the name, the preimage of the sender's session, so that a session cannot be used under
+    /// another name.
     pub(crate) nonce: SessionNonce,
     /// The sender's certificate in DER.
     pub(crate) certificate: Vec<u8>,
@@ -53,7 +55,8 @@ pub(crate) struct Attestation {
 /// Hash of all that one side signs.
 pub(crate) type Transcript = [u8; 32];
 
-/// Side of a handshake. Its label is in the signed text, so that no signature can be returned to its maker.
+/// Side of a handshake. Its label is in the signed text, so that no signature can be returned to
+/// its maker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     Prover,
@@ -91,7 +94,8 @@ pub(crate) struct Prover {
     notices: Notices,
 }
 
-/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's proof.
+/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's
+/// proof.
 pub(crate) type PendingKey = (SessionId, SocketAddr, Cookie);
 
 /// A proof that was sent and not yet accepted.
@@ -114,7 +118,7 @@ impl Prover {
         }
     }
 
-    /// Replaces the certificates and the time; true when the certificates are others.
+    /// Replaces the certificates and the time; returns true if the certificates have changed.
     pub(crate) fn set_identity(&mut self, identity: Identity) -> bool {
         let has_changed = !Arc::ptr_eq(&self.identity.credentials, &identity.credentials);
         self.identity = identity;
@@ -131,7 +135,7 @@ impl Prover {
         self.identity.credentials.certificate()
     }
 
-    /// True if a certificate that was verified before has expired meanwhile.
+    /// True if a previously verified certificate has expired in the meantime.
     pub(crate) fn has_expired(&self, proven: &Proven) -> bool {
         proven.expires.micros() / 1_000_000 < self.identity.wall.as_secs()
     }
@@ -159,7 +163,7 @@ impl Prover {
         None
     }
 
-    /// A key pair for one handshake; `None` when the system gives no random numbers.
+    /// A key pair for one handshake; `None` if the system provides no random numbers.
     pub(crate) fn draw_ephemeral(&self) -> Option<(EphemeralPrivateKey, [u8; 32])> {
         let private = EphemeralPrivateKey::generate(&X25519, &self.random).ok()?;
         let public = private.compute_public_key().ok()?;
@@ -210,7 +214,7 @@ impl Prover {
         Ok((proven, transcript))
     }
 
-    /// True if a challenge needs an answer: the proof for it is not under way already.
+    /// True if a challenge needs an answer: its proof is not already in transit.
     pub(crate) fn wants_proof(&mut self, key: &PendingKey, now: Timestamp) -> bool {
         self.pending
             .retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
@@ -218,8 +222,8 @@ impl Prover {
         self.pending.get(key).is_none_or(repeated)
     }
 
-    /// Remembers a proof that is sent. When all places are taken, the oldest of the host that has most gives way: forged
-    /// challenges take no other host's place.
+    /// Stores a proof that is sent. If all places are taken, the oldest proof of the host with most
+    /// proofs is dropped, so that forged challenges take no other host's place.
     pub(crate) fn expect_accept(
         &mut self,
         key: PendingKey,
@@ -264,14 +268,14 @@ impl Prover {
             .collect()
     }
 
-    /// The ephemeral key of a proof that was accepted. No other proof to the session waits any more.
+    /// The ephemeral key of an accepted proof. Other proofs to the session are dropped.
     pub(crate) fn take_pending(&mut self, key: &PendingKey) -> Option<EphemeralPrivateKey> {
         let proof = self.pending.remove(key);
         self.pending.retain(|(session, ..), _| *session != key.0);
         proof.map(|proof| proof.private)
     }
 
-    /// Notes that a node is not admitted.
+    /// Records that a node is not admitted.
     pub(crate) fn refuse(&mut self, name: &NodeName, from: SocketAddr, cause: &str) {
         self.notices.add(
             name,
@@ -329,7 +333,8 @@ impl SignedMessage<'_> {
     }
 }
 
-/// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's transcript.
+/// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's
+/// transcript.
 pub(crate) fn agree(
     cell: &CellKey,
     (private, theirs): (EphemeralPrivateKey, &[u8; 32]),

@@ -12,10 +12,11 @@ use super::config::MembershipConfig;
 /// One run of a node's membership, drawn at random.
 pub(crate) type SessionId = [u8; 16];
 
-/// Random number that makes a session of its own for each run, in a cell with certificates.
+/// Random number that makes the session unique for each run, in a cell with certificates.
 pub(crate) type SessionNonce = [u8; 16];
 
-/// The session of a node in a cell with certificates. Only a node of this name can show the nonce of it.
+/// The session of a node in a cell with certificates. Only a node of this name can show the nonce
+/// of it.
 pub(crate) fn session_of(name: &NodeName, nonce: &SessionNonce) -> SessionId {
     let text: [&[u8]; 3] = [b"ecod session 2", nonce, name.as_str().as_bytes()];
     let hash = digest::digest(&digest::SHA256, &text.concat());
@@ -43,7 +44,7 @@ pub enum KeyError {
     /// The key file is not there or cannot be read.
     #[error("cannot read cell key {path}: {source}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: std::path::PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -51,7 +52,7 @@ pub enum KeyError {
     /// The key file holds less than a key.
     #[error("cell key in {path} must have at least 12 characters")]
     TooShort {
-        /// The file.
+        /// Path of the file.
         path: std::path::PathBuf,
     },
 }
@@ -59,15 +60,15 @@ pub enum KeyError {
 /// Checks that the configured key can be used.
 ///
 /// # Errors
-/// [`KeyError`] when the key file cannot be used.
+/// Returns a [`KeyError`] if the key file cannot be used.
 pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyError> {
     CellKey::load(config, cell).map(drop)
 }
 
-/// The key that signs payloads, derived from the cell's.
+/// The key that signs payloads, derived from the cell's key.
 ///
 /// # Errors
-/// [`KeyError`] when the key file cannot be used.
+/// Returns a [`KeyError`] if the key file cannot be used.
 pub(crate) fn payload_key(
     config: &MembershipConfig,
     cell: &NodeName,
@@ -76,11 +77,11 @@ pub(crate) fn payload_key(
 }
 
 impl CellKey {
-    /// Reads the configured key. Without one the key is derived from the cell's name, which separates cells and gives
-    /// no protection.
+    /// Reads the configured key. Without one the key is derived from the cell's name, which
+    /// separates cells and gives no protection.
     ///
     /// # Errors
-    /// [`KeyError`] when the key file cannot be used.
+    /// Returns a [`KeyError`] if the key file cannot be used.
     pub(crate) fn load(config: &MembershipConfig, cell: &NodeName) -> Result<Self, KeyError> {
         let Some(path) = &config.key_file else {
             return Ok(Self::new(
@@ -132,12 +133,13 @@ impl CellKey {
         key.expect("HKDF gives as much as a hash's length")
     }
 
-    /// Public tag in every frame that tells cells apart.
+    /// Public tag in every frame, which distinguishes cells.
     pub(crate) fn tag(&self) -> [u8; 4] {
         self.tag
     }
 
-    /// The key of one session with certificates, of the secret that both sides agreed on and of their transcript.
+    /// The key of one session with certificates, derived from the shared secret of both sides and
+    /// their transcript.
     #[expect(
         clippy::expect_used,
         reason = "the length asked for is fixed and allowed"
@@ -156,8 +158,8 @@ impl CellKey {
         }
     }
 
-    /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames
-    /// share key and nonce.
+    /// The cipher of frames from one session to another. The sender's frame counter is the nonce,
+    /// so that every frame has a different pair of key and nonce.
     #[expect(
         clippy::expect_used,
         reason = "the length asked for is fixed and allowed"
@@ -178,7 +180,8 @@ impl CellKey {
 pub(crate) struct FrameCipher(aead::LessSafeKey);
 
 impl FrameCipher {
-    /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
+    /// Encrypts the bytes after the first `head` bytes of the frame, and authenticates the whole
+    /// frame.
     #[expect(
         clippy::expect_used,
         reason = "the cipher seals 256 GiB, a datagram has 64 KiB"

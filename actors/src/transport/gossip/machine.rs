@@ -1,10 +1,12 @@
-//! State machine of the membership: datagrams and time in, datagrams and events out. No socket, no clock.
+//! State machine of the membership: datagrams and time in, datagrams and events out. No socket, no
+//! clock.
 //!
 //! # Call order
 //!
-//! [`GossipMachine::new`], then [`GossipMachine::receive`] for every datagram, [`GossipMachine::tick`] at
-//! [`GossipMachine::next_deadline`], and the commands at any time. After each, [`GossipMachine::poll`] until nothing is
-//! left. A caller that was stalled hands in all datagrams that wait before it ticks; the time of the stall does not count.
+//! [`GossipMachine::new`], then [`GossipMachine::receive`] for every datagram,
+//! [`GossipMachine::tick`] at [`GossipMachine::next_deadline`], and the commands at any time. After
+//! each call, [`GossipMachine::poll`] until it returns `None`. A caller that was stalled passes all
+//! waiting datagrams before it ticks; the time of the stall does not count.
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -67,22 +69,23 @@ pub(crate) struct GossipMachine {
     hello: Duration,
     hello_at: Timestamp,
     hello_count: u64,
-    /// Greetings since this node last knew of another.
+    /// Greetings since this node last had another member.
     unanswered: u32,
-    /// Seeds from which something readable has come since then, this node's own address among them.
+    /// Seeds from which readable datagrams have arrived since then, including this node's own
+    /// address.
     answered: BTreeSet<SocketAddr>,
     seeds: Vec<SocketAddr>,
     /// Frames that wait for a session with their addressee.
     pending: HashMap<NodeName, PendingFrames>,
-    /// Nodes known by hearsay only, and when they were greeted.
+    /// Nodes that were only mentioned by other nodes, and the time of the last greeting to them.
     unproven: HashMap<NodeName, Timestamp>,
     /// The name last reported as taken, and when.
     taken: Option<(NodeName, Timestamp)>,
-    /// Since when all others say that this node's name is another's.
+    /// Time since which all other nodes report that this node's name belongs to another node.
     excluded_since: Option<Timestamp>,
-    /// Throttle of what is told about other hosts.
+    /// Throttle of reports about other hosts.
     notices: TokenBucket,
-    /// True if the node has to learn its address from others.
+    /// True if the node has to discover its address from other nodes.
     learns_address: bool,
     left: bool,
     rng: ChaCha8Rng,
@@ -145,12 +148,12 @@ impl GossipMachine {
         self.outputs.pop_front()
     }
 
-    /// Time at which [`Self::tick`] is next needed; none after leaving.
+    /// Time at which [`Self::tick`] is next needed; `None` after leaving.
     pub(crate) fn next_deadline(&self) -> Option<Timestamp> {
         (!self.left).then(|| self.clock.outside(self.due()))
     }
 
-    /// All living nodes but this one, by name.
+    /// All living nodes except this one, by name.
     pub(crate) fn members(&self) -> Vec<Member> {
         self.gossip
             .alive()
@@ -213,7 +216,8 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Sends a datagram to a node, once. A node that the gossip has just declared down is sent to for a while, too.
+    /// Sends a datagram to a node, once. Datagrams are also sent for a while to a node that the
+    /// gossip has just declared down.
     pub(crate) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
         let address = self
@@ -230,7 +234,7 @@ impl GossipMachine {
         }
     }
 
-    /// Replaces the addresses that are greeted besides the multicast group.
+    /// Replaces the addresses that are greeted in addition to the multicast group.
     pub(crate) fn set_seeds(&mut self, seeds: Vec<SocketAddr>) {
         if self.seeds != seeds {
             self.hello_count = 0;
@@ -239,7 +243,8 @@ impl GossipMachine {
         }
     }
 
-    /// Takes changed certificates and the time. Nodes whose certificate is no longer valid are down at once.
+    /// Sets changed certificates and the time. Nodes whose certificate has become invalid are down
+    /// at once.
     pub(crate) fn set_identity(&mut self, identity: Identity, now: Timestamp) {
         let at = self.advance(now);
         let (expelled, greeted) = self.sessions.set_identity(identity);
@@ -255,7 +260,7 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Gossips about a node, true or not.
+    /// Spreads a true or false statement about a node.
     #[cfg(test)]
     pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
         let at = self.advance(now);
@@ -263,7 +268,8 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
-    /// Tells all nodes that this one leaves. Afterwards nothing is sent or processed.
+    /// Announces to all nodes that this one leaves. Afterwards the machine sends and processes no
+    /// datagrams.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         let at = self.advance(now);
         if !self.left {
@@ -315,7 +321,8 @@ impl GossipMachine {
         Ok(())
     }
 
-    /// Processes the handshake of an admitted node: its knowledge of this node, then its identity.
+    /// Processes the handshake of an admitted node: its claims to this node's name, then its
+    /// identity.
     fn meet(
         &mut self,
         introduction: Introduction,
@@ -359,7 +366,7 @@ impl GossipMachine {
         }
     }
 
-    /// Sends SWIM's messages and delivers its events.
+    /// Sends the messages of SWIM and delivers its events.
     fn flush_swim(&mut self, at: Timestamp) {
         while let Some(rumour) = self.gossip.poll() {
             let event = match rumour {
@@ -427,7 +434,7 @@ impl GossipMachine {
         }
     }
 
-    /// Greets a node of which others tell, and whose certificate this node has not seen.
+    /// Greets a node that other nodes mention and whose certificate this node has not seen.
     fn meet_unproven(&mut self, id: NodeId, at: Timestamp) {
         self.unproven
             .retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
@@ -445,8 +452,9 @@ impl GossipMachine {
         }
     }
 
-    /// Greets all seeds that do not belong to a living node, so that a returning seed hears of its cell before it leads
-    /// on its own. Greets the multicast group too, less often once other nodes are alive.
+    /// Greets all seeds that do not belong to a living node, so that a returning seed discovers its
+    /// cell before it leads on its own. Greets the multicast group too, less often once other nodes
+    /// are alive.
     fn send_hellos(&mut self) {
         let frame = self.sessions.hello(self.gossip.own(), false);
         let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
@@ -462,8 +470,8 @@ impl GossipMachine {
         self.tell_silent_seeds();
     }
 
-    /// Names the seeds that have not answered for some greetings of a node that knows of no other. Only the other side can
-    /// read whose key or cell is wrong.
+    /// Reports the seeds that have not answered several greetings of a node without other members.
+    /// Only the other side can detect which side's key or cell is wrong.
     fn tell_silent_seeds(&mut self) {
         self.unanswered = if self.gossip.alive().is_empty() {
             self.unanswered + 1
@@ -507,8 +515,9 @@ impl GossipMachine {
         }
     }
 
-    /// Tells a node of this node's name that it is the second, or takes its word for that. A node that has just started is
-    /// the second; of two that met late, the one that started later is.
+    /// Handles another node with this node's name: informs it that it is the second one, or accepts
+    /// that this node is. A node that has just started is the second one; if the two discover each
+    /// other late, it is the node that started later.
     fn meet_namesake(
         &mut self,
         id: &NodeId,
@@ -528,7 +537,8 @@ impl GossipMachine {
         }
     }
 
-    /// Takes the word of a node that another run has this node's name. The other one may just have ended.
+    /// Handles a node's statement that another run has this node's name. The other run may just
+    /// have ended.
     fn step_back(&mut self, informant: SocketAddr, at: Timestamp) {
         let since = *self.excluded_since.get_or_insert(at);
         if at.since(since) >= NAME_PATIENCE && self.gossip.alive().is_empty() {
@@ -542,7 +552,8 @@ impl GossipMachine {
         self.report_taken(&name, cause, at);
     }
 
-    /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
+    /// A node as reported to other actors: with its own proven data if nodes of the cell prove
+    /// certificates, instead of other nodes' statements.
     fn member(&self, id: &NodeId) -> Member {
         let address = self.sessions.address(&id.name);
         let Some((stated, proven)) = self.sessions.proven(&id.name) else {
@@ -568,7 +579,8 @@ impl GossipMachine {
     }
 }
 
-/// Delay of a timer above which the process was stalled. Only this much of the delay counts as time.
+/// Delay of a timer above which the process was stalled. Only this much of the delay counts as
+/// time.
 const STALL: Duration = Duration::from_millis(40);
 
 /// Time for which frames wait for a session before they are dropped.
@@ -578,27 +590,30 @@ const SESSION_TIMEOUT: Duration = Duration::from_millis(200);
 const MAX_PENDING: usize = 64;
 const MAX_PENDING_FRAMES: usize = 4;
 
-/// Greetings without an answer, ten seconds' worth by default, after which silent seeds are named, and named again.
+/// Number of unanswered greetings, equivalent to ten seconds by default, after which silent seeds
+/// are reported, repeatedly.
 const SILENT_SEED_HELLOS: u32 = 20;
 
 /// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
 const MULTICAST_EVERY: u64 = 10;
 
-/// Minimum time between two greetings of a node that is known by hearsay only, and maximum such nodes in that time.
+/// Minimum time between two greetings of a node that was only mentioned by other nodes, and maximum
+/// number of such nodes in that time.
 const UNPROVEN_INTERVAL: Duration = Duration::from_secs(1);
 const MAX_UNPROVEN: usize = 256;
 
-/// Time after which a node whose name is another's gives up: well beyond that in which a run that ended is found to be down.
+/// Time after which a node whose name belongs to another node gives up: well above the time in
+/// which a run that ended is detected as down.
 const NAME_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Burst of what is told about other hosts, and time until one more.
+/// Burst of reports about other hosts, and time until one more.
 const NOTICE_BURST: u32 = 16;
 const NOTICE_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
-/// The trouble that a second run at an address is, in words.
+/// The trouble of a second run at an address, as text.
 fn second_run(at: SocketAddr) -> String {
     format!("a second run of this name, at {at}, does not take part; the first one does")
 }

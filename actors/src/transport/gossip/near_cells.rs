@@ -1,4 +1,5 @@
-//! Cells whose names are nearly this node's: frames tell a cell by a hash of its name only.
+//! Cells whose names are similar to this node's cell: a frame identifies its cell only by a hash of
+//! the name.
 
 use std::collections::BTreeMap;
 
@@ -6,11 +7,12 @@ use ecod::model::names::NodeName;
 
 use super::key::cell_tag;
 
-/// Cells of other tags that were heard, with those names that are one slip away from the own one.
+/// Tags of received other cells, with the cell's name if it is one typing error away from the own
+/// cell's name.
 #[derive(Debug, Default)]
 pub(crate) struct NearCells(BTreeMap<[u8; 4], Option<NodeName>>);
 
-/// Maximum tags that are remembered: whoever invents them makes this node search no more.
+/// Maximum number of stored tags, so that invented tags do not cause further searches.
 const MAX_TAGS: usize = 16;
 
 impl NearCells {
@@ -26,14 +28,14 @@ impl NearCells {
     }
 }
 
-/// True if two names differ in digits only, as those of neighbouring cells do.
+/// True if two names differ in digits only, like the names of neighbouring cells.
 pub(crate) fn are_numbered(one: &NodeName, other: &NodeName) -> bool {
     let letters = |name: &NodeName| name.as_str().replace(|c: char| c.is_ascii_digit(), "");
     letters(one) == letters(other)
 }
 
-/// All names that one slip of the hand makes of this one (Damerau, "A technique for computer detection and correction of
-/// spelling errors", Communications of the ACM 7(3), 1964).
+/// All names that result from one typing error in this name (Damerau, "A technique for computer
+/// detection and correction of spelling errors", Communications of the ACM 7(3), 1964).
 fn slips(name: &str) -> impl Iterator<Item = NodeName> + '_ {
     let letters = ('a'..='z')
         .chain('A'..='Z')

@@ -9,16 +9,17 @@ use serde::{Deserialize, Serialize};
 use super::Member;
 use super::socket::is_of_this_machine;
 
-/// Identity of a node. Of two with one name, the one with the greater `life` is accepted.
+/// Identity of a node. If two nodes have one name, the node with the greater `life` is accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct NodeId {
     pub(crate) name: NodeName,
     /// When the node started, in Unix microseconds by its own clock.
     pub(crate) run: u64,
-    /// Counts up from when the membership started, whenever the node returns from the dead or its addresses change.
+    /// Counts up from when the membership started, whenever the node returns from the dead or its
+    /// addresses change.
     pub(crate) life: u64,
     pub(crate) role: Role,
-    /// Address of its gossip socket; unspecified while the node does not know it.
+    /// Address of its gossip socket; unspecified until the node has discovered it.
     pub(crate) gossip: SocketAddr,
     pub(crate) broker: Option<SocketAddr>,
 }
@@ -27,13 +28,14 @@ pub(crate) struct NodeId {
 pub(crate) const MAX_CLAIMED_LIFE: u64 = 1 << 53;
 
 impl NodeId {
-    /// True if the node itself could have reached the life: it starts with the time of day, and grows by single steps.
+    /// True if the node itself could have reached the life: it starts with the time of day, and
+    /// grows by single steps.
     pub(crate) fn has_plausible_life(&self) -> bool {
         self.life <= 2 * MAX_CLAIMED_LIFE
     }
 
-    /// The node as other actors see it, at the `address` where it was seen. A broker on another machine's loopback
-    /// address is left out: this machine would find its own there.
+    /// The node as other actors see it, at the `address` where it was seen. A broker on another
+    /// machine's loopback address is left out: this machine would find its own there.
     pub(crate) fn member(&self, address: Option<SocketAddr>) -> Member {
         let gossip = address.unwrap_or(self.gossip);
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
@@ -83,7 +85,7 @@ mod tests {
             gossip: gossip.parse().unwrap(),
             broker: Some("127.0.0.1:1883".parse().unwrap()),
         };
-        // An address of nobody: reserved for documentation.
+        // An address reserved for documentation.
         assert_eq!(id("192.0.2.7:17884").member(None).broker, None);
         assert_eq!(
             id("127.0.0.1:17884").member(None).broker,

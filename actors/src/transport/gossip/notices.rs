@@ -1,4 +1,4 @@
-//! Troubles with other hosts that a membership sees, for its caller.
+//! Troubles with other hosts that a membership detects, for its caller.
 
 use ecod::diagnostics::TroubleKind;
 
@@ -11,7 +11,7 @@ pub(crate) struct GossipNotice {
     pub(crate) cause: String,
 }
 
-/// Notices that nobody has taken yet. One datagram causes one or two.
+/// Notices that have not been taken yet. One datagram causes one or two.
 #[derive(Debug, Default)]
 pub(crate) struct Notices(Vec<GossipNotice>);
 

@@ -2,11 +2,13 @@
 
 use super::counters::FrameEvent;
 
-/// Largest step by which one frame moves a window. The counter is that of all frames of a sender, so it may be far ahead
-/// for a node that was out of reach. A forged counter near the end would mute the sender.
+/// Largest step by which one frame moves a window. The counter counts all frames of a sender, so it
+/// may be far ahead for a node that was unreachable. A forged counter near the end would mute the
+/// sender.
 const MAX_JUMP: u64 = 1 << 20;
 
-/// Accepts every frame counter once, none that is 128 or more behind the highest, and none far ahead of it.
+/// Accepts every frame counter once; refuses counters that are 128 or more behind the highest, or
+/// far ahead of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct ReplayWindow {
     highest: u64,
@@ -26,8 +28,8 @@ impl ReplayWindow {
     /// Accepts a counter.
     ///
     /// # Errors
-    /// [`FrameEvent::Replayed`] when it was accepted before or is too old, [`FrameEvent::CounterJump`] when it is too far
-    /// ahead. The window is then as before.
+    /// Returns [`FrameEvent::Replayed`] if it was accepted before or is too old,
+    /// [`FrameEvent::CounterJump`] when it is too far ahead. The window is then as before.
     pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
         if let Some(ahead) = counter.checked_sub(self.highest).filter(|ahead| *ahead > 0) {
             if ahead > MAX_JUMP {
@@ -49,7 +51,8 @@ impl ReplayWindow {
         Ok(())
     }
 
-    /// Goes on after a counter that a fresh handshake has proven, however far ahead. It never goes back.
+    /// Continues after a counter that a fresh handshake has proven, however far ahead. The window
+    /// does not go back.
     pub(crate) fn skip_to(&mut self, counter: u64) {
         if counter > self.highest {
             *self = Self::after(counter);

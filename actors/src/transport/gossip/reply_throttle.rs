@@ -9,9 +9,10 @@ use ecod::model::time::Timestamp;
 use super::key::SessionId;
 use crate::platform::throttle::{KeyedThrottle, TokenBucket, host_network};
 
-/// Limits answers to all unknown hosts together, to each host, and to each session at its address. One recorded
-/// greeting, sent over and over, does not use up the share of others; nor does one host that makes up sessions. A host
-/// from which a node was admitted has room of its own: its restarted node is answered whatever strangers do.
+/// Limits answers to all unknown hosts together, to each host, and to each session at its address.
+/// Therefore one recorded greeting that is sent repeatedly, or one host that invents sessions,
+/// cannot use up the share of other hosts. A host from which a node was admitted has room of its
+/// own: its restarted node is answered regardless of traffic from unknown hosts.
 #[derive(Debug)]
 pub(crate) struct ReplyThrottle {
     all: TokenBucket,
@@ -36,8 +37,8 @@ impl ReplyThrottle {
         self.by_session.allow(&(*session, from), now) && self.allow_host(from, now)
     }
 
-    /// True if a proof from this address may be verified now, whatever session it claims: forged proofs must not use up
-    /// the share of an honest one.
+    /// True if a proof from this address may be verified now, independent of the claimed session:
+    /// forged proofs must not use up the share of an honest one.
     pub(crate) fn allow_host(&mut self, from: SocketAddr, now: Timestamp) -> bool {
         let host = host_network(from.ip());
         match self.known.get_mut(&host) {
@@ -46,7 +47,8 @@ impl ReplyThrottle {
         }
     }
 
-    /// Gives a host room of its own, as a node was admitted from there. The one heard of least lately gives way.
+    /// Gives a host room of its own, because a node was admitted from there. The host whose last
+    /// admission is oldest is dropped if there is no room.
     pub(crate) fn know(&mut self, from: SocketAddr, now: Timestamp) {
         let host = host_network(from.ip());
         if !self.known.contains_key(&host) && self.known.len() >= MAX_KNOWN {
@@ -62,8 +64,8 @@ impl ReplyThrottle {
     }
 }
 
-/// Burst of answers, and time until one more, in all and for one host. A cell of 64 nodes that start together, perhaps on
-/// one machine, stays below it.
+/// Burst of answers, and time until one more, in total and for one host. A cell of 64 nodes that
+/// start together, perhaps on one machine, stays below it.
 const REPLY_BURST: u32 = 256;
 const REPLY_INTERVAL: Duration = Duration::from_millis(10);
 const HOST_INTERVAL: Duration = Duration::from_millis(20);
@@ -84,7 +86,8 @@ mod tests {
         SocketAddr::from((Ipv4Addr::from(host), 1))
     }
 
-    /// Of the proofs that a host sends in a second, beside 500 made-up hosts, as many are verified.
+    /// Number of verified proofs among those that a host sends in a second, while 500 invented
+    /// hosts send too.
     fn verified_beside_a_flood(throttle: &mut ReplyThrottle, host: u32) -> usize {
         let verified = (0..1000u32).filter(|ms| {
             let now = Timestamp(u64::from(*ms) * 1000);

@@ -10,18 +10,20 @@ pub(crate) struct KeySet {
     pub(crate) to: FrameCipher,
     pub(crate) from: FrameCipher,
     pub(crate) window: ReplayWindow,
-    /// True if the other side has proven to have these keys: it has used them, or it made them.
+    /// True if the other side has proven that it has these keys: it has used them, or it created
+    /// them.
     pub(crate) is_confirmed: bool,
 }
 
-/// The keys in use with a node. Both sides may start a handshake at once, and the last message of one may be lost. So
-/// the keys of the last handshakes all open frames, and the latest that the other side surely has seal them.
+/// The keys in use with a node. Both sides may start a handshake at once, and the last message of
+/// one may be lost. Therefore the keys of the last handshakes all open frames, and the latest keys
+/// that the other side certainly has seal them.
 pub(crate) struct KeyRing {
     /// Latest first.
     sets: Vec<KeySet>,
 }
 
-/// Handshakes whose keys are kept: two at once, and the one before.
+/// Number of handshakes whose keys are kept: two simultaneous ones, and the previous one.
 const MAX_SETS: usize = 3;
 
 impl KeyRing {
@@ -29,7 +31,7 @@ impl KeyRing {
         Self { sets: vec![first] }
     }
 
-    /// Adds the keys of another handshake; those of the longest ago are forgotten.
+    /// Adds the keys of another handshake; the oldest keys are dropped.
     pub(crate) fn add(&mut self, keys: KeySet) {
         self.sets.insert(0, keys);
         self.sets.truncate(MAX_SETS);
@@ -66,7 +68,7 @@ impl KeyRing {
             .map_or(Ok(()), |keys| keys.window.take(counter))
     }
 
-    /// Goes on after a counter that a handshake has proven.
+    /// Continues after a counter that a handshake has proven.
     pub(crate) fn skip_to(&mut self, counter: u64) {
         self.sets
             .iter_mut()

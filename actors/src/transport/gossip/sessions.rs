@@ -1,12 +1,15 @@
-//! Authenticated sessions with other nodes, and the handshake that establishes them. No clock, no socket.
+//! Authenticated sessions with other nodes, and the handshake that establishes them. No clock, no
+//! socket.
 //!
-//! A session is one run of a node's membership. Each pair of sessions has keys of its own: a frame that was recorded
-//! before a restart, or meant for another node, does not decrypt. The sender's counter never repeats in a session, and
-//! the receiver accepts each value once. A node is admitted only when it returns a cookie just issued to its address: a
-//! recorded handshake admits nobody.
+//! A session is one run of a node's membership. Each pair of sessions has its own keys: a frame
+//! that was recorded before a restart, or addressed to another node, does not decrypt. The sender's
+//! counter does not repeat within a session, and the receiver accepts each value once. A node is
+//! admitted only when it returns a cookie just issued to its address, so a recorded handshake
+//! cannot admit a node.
 //!
-//! In a cell with certificates a node proves its own in the handshake, too, and the keys of the session come of it. Then
-//! the cell's key alone reads and forges nothing but handshakes that fail.
+//! In a cell with certificates a node also proves its certificate in the handshake, and the
+//! session's keys are derived from it. With the cell's key alone, an attacker can then only read
+//! and forge handshakes that fail.
 
 mod admission;
 mod peers;
@@ -46,7 +49,8 @@ pub(crate) struct Sessions {
     peers: PeerTable,
     /// The proof of this node's certificate, in a cell with certificates.
     prover: Option<Prover>,
-    /// Throttles of answers to greetings, of answers to challenges, of verifications, and of own greetings.
+    /// Throttles of answers to greetings, of answers to challenges, of verifications, and of own
+    /// greetings.
     challenges: ReplyThrottle,
     proofs: ReplyThrottle,
     verifications: ReplyThrottle,
@@ -71,7 +75,7 @@ pub(crate) struct Arrival<'a> {
     pub(crate) now: Timestamp,
     /// This node's identity.
     pub(crate) own: &'a NodeId,
-    /// True if this node has found no other.
+    /// True if this node has not found another node.
     pub(crate) is_alone: bool,
     /// State of a name in this node's gossip.
     pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
@@ -82,7 +86,7 @@ pub(crate) struct Arrival<'a> {
 pub(crate) enum FrameContent {
     /// A step of a handshake, with the answer to send.
     Answer(Vec<u8>),
-    /// A node was admitted. The answer tells it so, unless it knows already.
+    /// A node was admitted. The answer informs the node, unless it already has the session.
     Met {
         introduction: Introduction,
         answer: Option<Vec<u8>>,
@@ -101,9 +105,10 @@ pub(crate) enum FrameContent {
     Stranger,
     /// Two running nodes have this name.
     NameTaken(NodeName),
-    /// A running node that has this node's own name. The answer tells it so; without one, that is what it says.
+    /// A running node that has this node's name. The answer informs it; without an answer, it is
+    /// the other node that states the conflict.
     Namesake { id: NodeId, answer: Option<Vec<u8>> },
-    /// Nothing that needs an answer.
+    /// Content that needs no answer.
     Nothing,
 }
 
@@ -146,7 +151,8 @@ impl Sessions {
         self.prover.is_some()
     }
 
-    /// A greeting frame for any node of the cell; with `wants_session` for one that is to prove itself again.
+    /// A greeting frame for any node of the cell; with `wants_session` for a node that must prove
+    /// itself again.
     pub(crate) fn hello(&mut self, own: &NodeId, wants_session: bool) -> Vec<u8> {
         let head = self.head(FrameKind::Hello);
         let mut body = encode(&Hello {
@@ -175,7 +181,7 @@ impl Sessions {
         ))
     }
 
-    /// Address of a node that has answered nothing for a while, and is to be greeted for a new session.
+    /// Address of a node that has not answered for a while and must be greeted for a new session.
     pub(crate) fn unheard(&mut self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let proves = self.prove_certificates();
         let peer = self.peers.speaker_mut(name).filter(|_| proves)?;
@@ -191,20 +197,21 @@ impl Sessions {
         Some(self.peers.speaker(name)?.address)
     }
 
-    /// Identity of a node as it states it, and what its certificate proves; `None` in a cell without certificates.
+    /// Identity of a node according to itself, and the proof of its certificate; `None` in a cell
+    /// without certificates.
     pub(crate) fn proven(&self, name: &NodeName) -> Option<(&NodeId, &Proven)> {
         let peer = self.peers.speaker(name)?;
         Some((&peer.id, peer.proven.as_ref()?))
     }
 
-    /// True if a node was heard a moment ago.
+    /// True if a frame of the node was received a moment ago.
     pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
         self.peers
             .speaker(name)
             .is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
     }
 
-    /// Address of the node of a name, if it was heard lately.
+    /// Address of the node of a name, if a frame of it was received recently.
     pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let peer = self.peers.speaker(name)?;
         (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
@@ -219,14 +226,15 @@ impl Sessions {
         may_send
     }
 
-    /// Ends the session of an earlier run of a node; false when there is none. Of a node that proves its certificate
-    /// only its own handshake does so.
+    /// Ends the session of an earlier run of a node; returns false if there is none. For a node
+    /// that proves its certificate, only its own handshake can do so.
     pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         !self.prove_certificates() && self.peers.end_earlier_run(name, run, now)
     }
 
-    /// Takes changed certificates and the time. Ends all sessions whose certificate is no longer valid; the result are
-    /// the nodes that had them, and those that are to be shown this node's new certificate.
+    /// Sets changed certificates and the time. Ends all sessions whose certificate has become
+    /// invalid. Returns their nodes, and the addresses of nodes that must receive this node's new
+    /// certificate.
     pub(crate) fn set_identity(&mut self, identity: Identity) -> (Vec<NodeName>, Vec<SocketAddr>) {
         let Some(prover) = &mut self.prover else {
             return Default::default();
@@ -255,13 +263,13 @@ impl Sessions {
         (expelled, greeted)
     }
 
-    /// Forgets all sessions, as if they had given way to others.
+    /// Removes all sessions, as if other sessions had replaced them.
     #[cfg(test)]
     pub(crate) fn forget_all(&mut self) {
         self.peers.expel(|_| true);
     }
 
-    /// Processes a datagram. An error means junk, which changed nothing.
+    /// Processes a datagram. An error means junk, which did not change the state.
     pub(crate) fn open(
         &mut self,
         frame: &[u8],
@@ -315,7 +323,8 @@ impl Sessions {
         now: Timestamp,
     ) -> Result<FrameContent, FrameEvent> {
         let Some(peer) = self.peers.get_mut(&head.sender) else {
-            // Without certificates the keys are known, and the node itself is not. With them it greets when unheard.
+            // Without certificates the keys can be derived, although the node itself is unknown.
+            // With certificates the node greets when it gets no answer.
             let unsealed = if self.prove_certificates() {
                 None
             } else {
@@ -364,7 +373,7 @@ impl Sessions {
         notices
     }
 
-    /// Notes a greeting under another key.
+    /// Records a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
         let cause = format!(
             "heard cell {} with another key, or none, from {}",
@@ -374,7 +383,8 @@ impl Sessions {
         self.notices.add(&from.ip(), TroubleKind::WrongKey, cause);
     }
 
-    /// Notes a cell with nearly this one's name. Numbered cells may be neighbours, unless this node has found nobody.
+    /// Records a cell with a similar name. Numbered cells may be neighbours, unless this node has
+    /// found no other node.
     fn note_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
         let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else {
             return;
@@ -393,7 +403,8 @@ impl Sessions {
         }
     }
 
-    /// Refuses a frame of a node with certificates where this one has none, or the reverse; a greeting tells who it is.
+    /// Refuses a frame of a node with certificates if this node has none, or the reverse; a
+    /// greeting contains the node's name.
     fn refuse_version(&mut self, head: &FrameHeader, frame: &[u8], from: SocketAddr) -> FrameEvent {
         let greeting = if head.kind == FrameKind::Hello {
             self.unseal(head, &BROADCAST, frame)
@@ -446,17 +457,19 @@ impl Sessions {
 const HELLO_BURST: u32 = 256;
 const HELLO_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Idle time after which a session may be replaced. It is then sent to only if the gossip holds the node alive.
+/// Idle time after which a session may be replaced. Frames are then sent to it only if the gossip
+/// considers the node alive.
 const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Time for which a node that was heard is not doubted on the word of others, and is not believed to be elsewhere. It is
-/// about as long as the gossip takes to find that a node is down.
+/// Time after a frame of a node during which other nodes' statements that it is down or elsewhere
+/// are ignored. It is about as long as the gossip takes to detect that a node is down.
 const HEARD_TIME: Duration = Duration::from_millis(400);
 
 /// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);
 
-/// Time without an answer after which a node is asked for a new session: it may have lost the keys.
+/// Time without an answer after which a new session is requested from a node: it may have lost the
+/// keys.
 const UNHEARD_TIMEOUT: Duration = Duration::from_millis(500);
 
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
@@ -468,7 +481,7 @@ pub(super) fn decode<T: DeserializeOwned>(body: &[u8]) -> Result<T, FrameEvent> 
     postcard::from_bytes(body).map_err(|_| FrameEvent::Malformed)
 }
 
-/// Decodes the beginning of a body; also gives the rest.
+/// Decodes the beginning of a body; also returns the rest.
 pub(super) fn decode_first<T: DeserializeOwned>(body: &[u8]) -> Result<(T, &[u8]), FrameEvent> {
     postcard::take_from_bytes(body).map_err(|_| FrameEvent::Malformed)
 }

@@ -1,4 +1,5 @@
-//! Sockets of the membership: the node's own, and the multicast socket that all nodes of a machine share.
+//! Sockets of the membership: the node's own, and the multicast socket that all nodes of a machine
+//! share.
 
 use std::io::{self, ErrorKind};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -160,7 +161,7 @@ mod tests {
             ..MembershipConfig::default()
         })
         .unwrap();
-        // An interface of nobody: reserved for documentation.
+        // An interface address reserved for documentation.
         let absent = MulticastConfig {
             interface: Some(Ipv4Addr::new(192, 0, 2, 7)),
             ..MulticastConfig::default()

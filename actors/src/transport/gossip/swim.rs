@@ -33,7 +33,8 @@ pub(crate) enum SwimOutput {
     Down(NodeName),
     /// A living node's identity changed.
     Changed(NodeId),
-    /// Others tell of a node that this one has not met, where only met ones count.
+    /// Other nodes mention a node that this node has not admitted, in a cell where only admitted
+    /// nodes count.
     Unproven(NodeId),
 }
 
@@ -44,7 +45,8 @@ pub(crate) struct Swim {
     timers: BinaryHeap<Reverse<ScheduledTimer>>,
     scheduled: u64,
     alive: BTreeMap<NodeName, NodeId>,
-    /// Lives of the nodes that were met, by their own word, in a cell with certificates: hearsay does not go beyond.
+    /// Lives of the admitted nodes according to themselves, in a cell with certificates: other
+    /// nodes' statements cannot exceed them.
     lives: Option<BTreeMap<NodeName, u64>>,
     /// Time of this node's last renewal after it was declared down, and of the next.
     renewed_at: Option<Timestamp>,
@@ -91,7 +93,7 @@ impl Swim {
         self.foca.identity()
     }
 
-    /// All living nodes but this one, by name.
+    /// All living nodes except this one, by name.
     pub(crate) fn alive(&self) -> &BTreeMap<NodeName, NodeId> {
         &self.alive
     }
@@ -118,7 +120,8 @@ impl Swim {
 
     /// Processes a message that `from` has authenticated.
     ///
-    /// In a cell with certificates the word of a node that this one hears itself (`is_heard`) outweighs that of others.
+    /// In a cell with certificates, frames received directly from a node (`is_heard`) outweigh
+    /// other nodes' statements about it.
     pub(crate) fn receive(
         &mut self,
         from: &NodeName,
@@ -147,8 +150,9 @@ impl Swim {
         result.map_err(|_| FrameEvent::Malformed)
     }
 
-    /// A message without hearsay: news of nodes that this one has not met, lives that a node has not claimed itself, and
-    /// doubts about nodes that this one hears.
+    /// Removes second-hand statements from a message: news of nodes that this node has not
+    /// admitted, lives that a node has not claimed itself, and suspicions of nodes that this node
+    /// receives directly.
     fn without_hearsay(
         &mut self,
         from: &NodeId,
@@ -208,14 +212,14 @@ impl Swim {
         }
     }
 
-    /// Announces this node to one that was just admitted.
+    /// Announces this node to a node that was just admitted.
     pub(crate) fn meet(&mut self, peer: NodeId, now: Timestamp) {
         self.note_met(&peer);
         let announced = self.foca.announce(peer, &mut self.runtime);
         self.finish("announce", announced, now);
     }
 
-    /// Notes what a node says of itself.
+    /// Records an admitted node's statement about itself.
     pub(crate) fn note_met(&mut self, peer: &NodeId) {
         if let Some(lives) = &mut self.lives {
             let life = lives.entry(peer.name.clone()).or_default();
@@ -223,7 +227,7 @@ impl Swim {
         }
     }
 
-    /// Declares a node down that may no longer take part.
+    /// Declares a node down that may not be a member any more.
     pub(crate) fn remove(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(lives) = &mut self.lives {
             lives.remove(name);
@@ -249,7 +253,7 @@ impl Swim {
         self.finish("lie", spread, now);
     }
 
-    /// Takes a `life` after that of the node that had this name before.
+    /// Takes a `life` after the life of the node that had this name before.
     pub(crate) fn start_life_after(&mut self, life: u64, now: Timestamp) {
         if life >= self.own().life {
             self.change(now, |own| own.life = life);
@@ -265,7 +269,7 @@ impl Swim {
         self.finish("change of identity", changed, now);
     }
 
-    /// Tells the others that this node leaves.
+    /// Announces to the other nodes that this node leaves.
     pub(crate) fn leave(&mut self, now: Timestamp) {
         self.left = true;
         let left = self.foca.leave_cluster(&mut self.runtime);

@@ -78,7 +78,7 @@ impl TrialAuthority {
         }
     }
 
-    /// Revokes a node; the others learn of it when they read the list.
+    /// Revokes a node; other nodes discover it when they read the list.
     #[cfg(test)]
     pub(crate) fn revoke(&mut self, name: &NodeName) {
         self.authority

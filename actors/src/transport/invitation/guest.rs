@@ -26,16 +26,16 @@ use super::{
 /// Maximum time for a connection to one address of the host.
 const CONNECT_TIME: Duration = Duration::from_secs(3);
 
-/// A node that was let in. The host counts it as joined after [`Joined::keep`].
+/// A node that was admitted. The host counts it as joined after [`Joined::keep`].
 pub struct Joined {
     /// Certificate, cell's key and the rest.
     pub welcome: Welcome,
-    /// The node's private key in PEM, which nobody else has.
+    /// The node's private key in PEM, which stays on this machine.
     pub key: String,
     stream: BufStream<TlsStream<TcpStream>>,
 }
 
-/// A failure to join; the token works on.
+/// A failure to join; the token remains valid.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
     /// No address of the host can be reached.
@@ -59,10 +59,10 @@ pub enum JoinError {
     Key(#[from] rcgen::Error),
 }
 
-/// Asks the host of a token to be let in.
+/// Requests admission from the host of a token.
 ///
 /// # Errors
-/// [`JoinError`].
+/// Returns a [`JoinError`].
 pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
     let key = KeyPair::generate()?;
     let signing = CertificateParams::default()
@@ -97,10 +97,11 @@ pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
 }
 
 impl Joined {
-    /// Tells the host that all is on disk, so that the token is used up.
+    /// Confirms to the host that all files are on disk, so that the token is used up.
     ///
     /// # Errors
-    /// When the host does not confirm it: it will revoke the certificate.
+    /// Returns an error if the host does not acknowledge the confirmation: it will then revoke the
+    /// certificate.
     pub async fn keep(mut self) -> io::Result<()> {
         let told = async {
             write_line(&mut self.stream, &KEPT).await?;
@@ -146,7 +147,7 @@ async fn connect(token: &Token) -> Result<TlsStream<TcpStream>, JoinError> {
     })
 }
 
-/// Trust in one certificate, whatever its names and validity.
+/// Trust in one certificate, independent of its names and validity.
 #[derive(Debug)]
 struct PinnedVerifier {
     fingerprint: [u8; 32],

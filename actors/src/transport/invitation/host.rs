@@ -1,4 +1,4 @@
-//! The side that has the CA: it lets each guest in once.
+//! The side that has the CA; it admits each guest once.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -43,7 +43,7 @@ pub struct Host {
 struct Guest {
     rights: Rights,
     secret: [u8; 16],
-    /// Serial number of the certificate that it got last.
+    /// Serial number of the last certificate issued to the guest.
     issued: Option<String>,
 }
 
@@ -54,11 +54,12 @@ pub enum Visit {
     Joined(NodeName),
     /// The token of the node was used by two guests. The certificate of the first one is revoked.
     UsedAgain(NodeName),
-    /// Nothing was given, or the guest did not say that it has kept it: address and reason.
+    /// No certificate was issued, or the guest did not confirm that it has stored it: address and
+    /// reason.
     Failed(SocketAddr, String),
 }
 
-/// Maximum number of failures that are told.
+/// Maximum number of failures that are reported.
 const MAX_FAILURES: usize = 256;
 
 /// Conversations at once; more wait.
@@ -73,11 +74,11 @@ type Question = (Request, oneshot::Sender<Answer>);
 type Answer = (Reply, Option<String>);
 
 impl Host {
-    /// A host without guests. `seeds` are `host:port` of nodes that a guest asks for the cell. Guests get the files of the `city`
-    /// as they are then.
+    /// A host without guests. `seeds` are `host:port` of nodes through which a guest finds the
+    /// cell. Guests get the current files of the `city`.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the system makes no keys.
+    /// Returns an [`AuthorityError`] if the system cannot create keys.
     pub fn new(
         authority: Authority,
         cell_key: String,
@@ -111,11 +112,12 @@ impl Host {
         })
     }
 
-    /// The token of a node, which finds the host at one of the addresses. A former token of the node does not work
-    /// any more.
+    /// Creates the token of a node, with which it finds the host at one of the addresses. A former
+    /// token of the node becomes invalid.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the name cannot have a certificate or the system gives no random numbers.
+    /// Returns an [`AuthorityError`] if the name cannot have a certificate or the system provides
+    /// no random numbers.
     pub fn invite(
         &mut self,
         node: &NodeName,
@@ -142,9 +144,11 @@ impl Host {
         })
     }
 
-    /// Serves guests until all have joined or the time is over, and tells of each visit; gives those that did not come.
+    /// Serves guests until all have joined or the time is over, and reports each visit; returns the
+    /// guests that did not join.
     ///
-    /// Of each host, one failure for each reason is told. Certificates that were not kept are revoked at the end.
+    /// For each host, one failure per reason is reported. Certificates that were not stored are
+    /// revoked at the end.
     pub async fn serve(
         mut self,
         listener: TcpListener,
@@ -215,7 +219,8 @@ impl Host {
     fn welcome(&mut self, request: &Request) -> Result<(Welcome, String), String> {
         let unusable =
             |error: &dyn std::fmt::Display| format!("the host cannot issue a certificate: {error}");
-        // Hashes are compared: the time that it takes tells nothing of the secret.
+        // Hashes are compared, so that the time of the comparison reveals no information about the
+        // secret.
         let hash = |secret: &[u8]| digest(&SHA256, secret).as_ref().to_vec();
         let secret = hex::decode(&request.secret).unwrap_or_default();
         let guest = self
@@ -264,7 +269,8 @@ impl Host {
     }
 }
 
-/// The key that is to be certified, in DER, of a guest's message that is complete. Only built for the fuzz targets.
+/// The key that is to be certified, in DER, of a guest's message that is complete. Only built for
+/// the fuzz targets.
 #[cfg(fuzzing)]
 pub fn read_request(sent: &[u8]) -> Option<Vec<u8>> {
     use futures_util::FutureExt;
@@ -278,7 +284,8 @@ pub fn read_request(sent: &[u8]) -> Option<Vec<u8>> {
     Some(signing.public_key.der_bytes().to_vec())
 }
 
-/// One conversation; gives the node that has kept what it got, and the serial number of its certificate.
+/// One conversation; returns the node that has stored its files, and the serial number of its
+/// certificate.
 async fn receive(
     tls: TlsAcceptor,
     stream: TcpStream,

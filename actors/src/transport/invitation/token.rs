@@ -22,7 +22,7 @@ pub struct Token {
     pub(super) secret: [u8; 16],
 }
 
-/// A text that is no token, or not a whole one.
+/// A text that is not a token, or not a whole one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`"
@@ -76,7 +76,8 @@ impl FromStr for Token {
     }
 }
 
-/// True if a token with this content, if it is one, is read as it is written. Only built for the fuzz targets.
+/// True if a token with this content, if it is one, is read as it is written. Only built for the
+/// fuzz targets.
 #[cfg(fuzzing)]
 pub fn token_is_read_as_written(content: &[u8]) -> bool {
     let token: Result<Token, _> = text_of(content.to_vec()).parse();

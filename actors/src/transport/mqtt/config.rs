@@ -14,48 +14,58 @@ use crate::platform::secret::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MqttConfig {
-    /// An external broker as `host:port`; default none: the brokers embedded in the nodes are used.
+    /// An external broker as `host:port`; default: not set, the brokers embedded in the nodes are
+    /// used.
     pub broker: Option<BrokerAddress>,
-    /// True if the embedded brokers are used beside an external one; default false. Trade-off: the cell survives the loss
-    /// of the external broker, and every message is sent twice while it is there.
+    /// Whether the embedded brokers are used in addition to an external one; default false.
+    /// Trade-off: the cell survives the loss of the external broker, and every message is sent
+    /// twice while it is available.
     pub fallback_to_embedded: bool,
-    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
+    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized
+    /// packets away).
     pub version: MqttVersion,
-    /// User name; default none. Needs `password`.
+    /// User name; default: not set. Needs `password`.
     pub user: Option<String>,
-    /// Password; default none. Never printed.
+    /// Password; default: not set. It is not printed.
     pub password: Option<Secret>,
-    /// PEM file with the CAs of the external broker's certificate; default none: plaintext. The host in `broker` must be
-    /// a name in the certificate. A node with `[tls]` presents its own certificate.
+    /// PEM file with the CAs of the external broker's certificate; default: not set, plaintext. The
+    /// host in `broker` must be a name in the certificate. A node with `[tls]` presents its own
+    /// certificate.
     pub ca: Option<PathBuf>,
-    /// True if payloads are signed with the cell's key and unsigned ones rejected; default false. For an external broker
-    /// that others use too. Must be the same on every node. Other subscribers have to skip the signature.
+    /// Whether payloads are signed with the cell's key and unsigned ones rejected; default false.
+    /// For an external broker that other parties use too. Must be equal on every node. Other
+    /// subscribers have to skip the signature.
     pub sign: bool,
-    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
-    /// quarter of the bytes, rounded to millimetres and 0.05 %).
+    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of
+    /// numbers) or `"compact"` (a quarter of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
-    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off: shorter notices a dead
-    /// network path sooner and costs packets. Not the failure detector, which is the gossip.
+    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off:
+    /// shorter notices a dead network path sooner and costs packets. Not the failure detector,
+    /// which is the gossip.
     pub keep_alive_s: u16,
     /// Milliseconds within which a broker must accept a connection; default 2000.
     pub connect_timeout_ms: u64,
     /// Milliseconds before the first attempt to reconnect, doubled with every failure; default 50.
     pub retry_min_ms: u64,
-    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to half is taken off each
-    /// wait, so that a cell's vehicles do not return all at once.
+    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to
+    /// half is taken off each wait, so that a cell's vehicles do not return all at once.
     pub retry_max_ms: u64,
-    /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are refused and counted.
+    /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are
+    /// refused and counted.
     pub send_queue: usize,
-    /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones are dropped and counted.
+    /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones
+    /// are dropped and counted.
     pub inbox: usize,
-    /// Maximum reports per second of one vehicle and kind, shares of evidence of one candidate, and statuses of one node;
-    /// default 100. The same number is the burst. Further ones are not decoded, and counted by node. Trade-off: more lets
-    /// one node take the others' time.
+    /// Maximum reports per second of one vehicle and kind, shares of evidence of one candidate, and
+    /// statuses of one node; default 100. The same number is the burst. Further ones are not
+    /// decoded, and counted by node. Trade-off: a higher value lets one node take the processor
+    /// time of others.
     pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,
-    /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608, 512 bytes for each of
-    /// 16,384 locations. Trade-off: larger admits larger cells, smaller bounds what an attacker can make a node read.
+    /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608,
+    /// 512 bytes for each of 16,384 locations. Trade-off: a larger value admits larger cells, a
+    /// smaller one limits the size of an attacker's messages.
     pub max_map_bytes: usize,
     /// Maximum objects, and maximum seen landmarks, in a report; default 1024.
     pub max_objects: usize,
@@ -91,7 +101,7 @@ impl MqttConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let min_keep_alive_s = match self.version {
             MqttVersion::V311 => 1.0,
@@ -159,7 +169,8 @@ impl MqttConfig {
         }
     }
 
-    /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the link.
+    /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the
+    /// link.
     pub fn max_packet_bytes(&self) -> usize {
         self.max_payload_bytes.max(self.max_map_bytes) + PACKET_OVERHEAD_BYTES
     }

@@ -1,4 +1,4 @@
-//! One MQTT connection, 3.1.1 or 5. It is never reconnected, so that no old message is sent late.
+//! One MQTT connection, 3.1.1 or 5. It is not reconnected, so that old messages are not sent late.
 
 use std::error::Error;
 use std::io;
@@ -16,7 +16,7 @@ use rustls::ClientConfig;
 use super::config::{MqttConfig, MqttVersion};
 use crate::transport::pki::CredentialsError;
 
-/// QoS and retention of a message, as the topics' contract says.
+/// QoS and retention of a message, as defined for its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Retention {
     /// QoS 0, not retained: the next message replaces it.
@@ -29,16 +29,16 @@ pub(crate) enum Retention {
     Repeated,
 }
 
-/// Highest QoS of what a subscription brings.
+/// Maximum QoS of a subscription's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MaxQos {
-    /// QoS 0: brokers keep nothing for the subscriber.
+    /// QoS 0: brokers queue no messages for the subscriber.
     AtMostOnce,
     /// QoS 1.
     AtLeastOnce,
 }
 
-/// The sending half; never waits.
+/// The sending half; it does not block.
 #[derive(Debug)]
 pub(crate) enum Client {
     V311(rumqttc::AsyncClient),
@@ -61,7 +61,8 @@ pub(crate) enum Packet {
     Disconnected,
     /// The broker refused filters of a subscription: index of each filter and reason.
     SubscriptionRefused(Vec<(usize, String)>),
-    /// The broker refused a message of QoS 1, with its reason if it gave one; MQTT 5 alone tells.
+    /// The broker refused a message of QoS 1, with its reason if it gave one; only MQTT 5 reports
+    /// refusals.
     PublishRefused(String),
     /// A packet was sent.
     Sent,
@@ -72,7 +73,7 @@ pub(crate) enum Packet {
 /// Reason for the end of a connection.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ConnectionError {
-    /// Nothing listens at the address: the broker's process is gone.
+    /// The port is closed: the broker's process is gone.
     #[error("{0}")]
     NotListening(String),
     /// The broker rejected the login, or one side rejected the other's certificate.
@@ -101,7 +102,7 @@ impl ConnectionError {
         }
     }
 
-    /// An error that is the same in both versions of the protocol.
+    /// An error that is common to both versions of the protocol.
     fn of(error: &(dyn Error + 'static)) -> Self {
         let causes = || std::iter::successors(Some(error), |&error| error.source());
         let io_errors = || causes().filter_map(|error| error.downcast_ref::<io::Error>());
@@ -310,7 +311,8 @@ impl Client {
         })
     }
 
-    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no room.
+    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no
+    /// room.
     pub(crate) fn disconnect(&self) -> bool {
         match self {
             Self::V311(client) => client.try_disconnect().is_ok(),

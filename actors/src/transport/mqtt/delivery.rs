@@ -15,8 +15,9 @@ use tokio::sync::OwnedSemaphorePermit;
 
 /// A checked message of the cell, or news about a link.
 ///
-/// The same message may arrive over several links. The report window drops the second report by node and capture time.
-/// Receivers of maps, verdicts and reputations drop it by epoch and round. A repeated status does no harm.
+/// The same message may arrive over several links. The report window drops the second report by
+/// node and capture time. Receivers of maps, verdicts and reputations drop it by epoch and round. A
+/// repeated status does no harm.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {
     /// A vehicle's report; for candidates and observers only.
@@ -43,11 +44,11 @@ pub enum Incoming {
         /// The broker that forwarded it.
         via: BrokerAddress,
     },
-    /// A node has stopped, or no longer uses this broker, and took its status back.
+    /// A node has stopped, or has stopped using this broker, and withdrew its status.
     StatusWithdrawn {
-        /// The node.
+        /// Name of the node.
         node: NodeName,
-        /// The broker that told it.
+        /// The broker that forwarded it.
         via: BrokerAddress,
     },
     /// The state of a link changed.
@@ -59,23 +60,24 @@ pub enum Incoming {
     },
 }
 
-/// A message on its way to a receiver. It occupies a place in the inbox until it is dropped: keep it until it is processed.
+/// A message on its way to a receiver. It occupies a place in the inbox until it is dropped, so
+/// keep it until it is processed.
 #[derive(Debug)]
 pub struct Delivery<T = Incoming> {
     /// The message.
     pub message: T,
     /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,
-    /// Proof of a round's aggregator; of other messages nothing is asked.
+    /// Proof of a round's aggregator; other messages need no such proof.
     pub origin: Origin,
-    /// The node whose certificate the broker has proven, of a link in its last handshake; `None` without certificates, and
-    /// for messages of this node.
+    /// The node whose certificate the broker has proven, of a link in its last handshake; `None`
+    /// without certificates, and for messages of this node.
     pub broker: Option<NodeName>,
     pub(super) _place: Option<OwnedSemaphorePermit>,
 }
 
 impl<T> Delivery<T> {
-    /// A message of this node itself. It occupies no place: the node's own pace bounds it.
+    /// A message of this node itself. It occupies no place, because the node's own pace limits it.
     pub(crate) fn local(message: T, at: Timestamp) -> Self {
         Self {
             message,
@@ -86,7 +88,7 @@ impl<T> Delivery<T> {
         }
     }
 
-    /// The same delivery of a part of its message: all else stays.
+    /// The same delivery for a part of its message; the other fields are unchanged.
     pub(crate) fn map<U>(self, part: impl FnOnce(T) -> U) -> Delivery<U> {
         let Self {
             message,
@@ -105,5 +107,5 @@ impl<T> Delivery<T> {
     }
 }
 
-/// Callback that takes messages to their receivers. It runs on the link's task and must not block.
+/// Callback that passes messages to their receivers. It runs on the link's task and must not block.
 pub type Subscriber = Arc<dyn Fn(Delivery) + Send + Sync>;

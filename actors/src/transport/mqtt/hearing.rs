@@ -1,8 +1,8 @@
-//! Incoming packets of a link, counted for the gateway: whether a broker passes anything on.
+//! Incoming packets of a link, counted for the gateway: shows whether a broker forwards messages.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-/// Counter of what a link's task reads, for the gateway to see.
+/// Counter of the packets read by a link's task, for the gateway.
 #[derive(Debug, Default)]
 pub(crate) struct Hearing {
     packets: AtomicU64,
@@ -10,13 +10,13 @@ pub(crate) struct Hearing {
 }
 
 impl Hearing {
-    /// Notes that something came in; true when the broker was taken for stalled.
+    /// Records a received packet; returns true if the broker counted as stalled.
     pub(crate) fn note(&self) -> bool {
         self.packets.fetch_add(1, Ordering::AcqRel);
         self.is_missed.load(Ordering::Acquire) && self.is_missed.swap(false, Ordering::AcqRel)
     }
 
-    /// Asks to be told when something comes in.
+    /// Requests a notification when the next packet is received.
     pub(crate) fn miss(&self) {
         self.is_missed.store(true, Ordering::Release);
     }

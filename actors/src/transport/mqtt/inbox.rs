@@ -136,7 +136,7 @@ impl Inbox {
     ) -> Result<PacketOutcome, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
         let payload = match &self.security.signing {
-            // An empty payload deletes a retained message. It carries nothing to sign.
+            // An empty payload deletes a retained message. It has no content to sign.
             Some(key) if !payload.is_empty() => key
                 .verify(topic, payload)
                 .ok_or(RejectReason::BadSignature)?,
@@ -217,7 +217,8 @@ impl Inbox {
         Ok(self.deliver(via, message, origin, received_at))
     }
 
-    /// Decodes a map, verdicts or reputations. Entries out of bounds are left out and counted; the rest is used.
+    /// Decodes a map, verdicts or reputations. Entries out of bounds are left out and counted; the
+    /// rest is used.
     fn decode_entries<T: Payload>(
         &self,
         payload: &[u8],
@@ -240,7 +241,7 @@ impl Inbox {
         Ok(message)
     }
 
-    /// Proof of a round's aggregator; `None` if the broker is not to be believed.
+    /// Proof of a round's aggregator; `None` if the round must be refused from this broker.
     fn origin(
         &self,
         via: Via<'_>,
@@ -253,7 +254,7 @@ impl Inbox {
         })
     }
 
-    /// Checks that a round is not from the far future, as far as this node knows the time.
+    /// Checks that a round is not from the far future, as far as this node has a time estimate.
     fn check_date(&self, fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
         self.clock
             .date_if_set(received_at)
@@ -334,7 +335,7 @@ impl Inbox {
         })
     }
 
-    /// Name of the node that a topic belongs to, or else the address of the broker.
+    /// Name of the node that a topic belongs to; if there is none, the address of the broker.
     fn source(&self, via: Via<'_>, topic: &[u8]) -> String {
         let topic = std::str::from_utf8(topic)
             .ok()
@@ -426,7 +427,7 @@ mod tests {
     use super::*;
     use crate::telemetry::counters::Shed;
 
-    /// The edge's, for so many undelivered messages and reports a second.
+    /// The inbox of the edge, with limits for undelivered messages and for reports per second.
     fn inbox(
         (capacity, max_report_hz): (usize, u32),
         counters: &Arc<Counters>,
@@ -468,7 +469,8 @@ mod tests {
         )
     }
 
-    /// One of 30 reports a second that counts what it delivers by the node that `node_of` names.
+    /// An inbox for 30 reports per second that counts its deliveries by the node that `node_of`
+    /// returns.
     fn counting(
         counters: &Arc<Counters>,
         node_of: impl Fn(&Incoming) -> &NodeName + Send + Sync + 'static,

@@ -39,7 +39,8 @@ pub struct LinkEvent {
 
 #[derive(Debug)]
 pub(crate) enum LinkChange {
-    /// The broker accepted the connection; nothing is subscribed yet. `node` is the one whose certificate it has, if any.
+    /// The broker accepted the connection; there are no subscriptions yet. `node` is the node whose
+    /// certificate the broker has, if any.
     Accepted {
         client: Client,
         node: Option<NodeName>,
@@ -50,7 +51,7 @@ pub(crate) enum LinkChange {
     Namesake(Uuid),
     /// A stalled broker has sent a packet.
     Answered,
-    /// Not connected; attempts go on.
+    /// Not connected; attempts continue.
     Lost(LinkState),
 }
 
@@ -66,7 +67,7 @@ pub(crate) struct LinkSetup {
     pub(crate) config: MqttConfig,
     pub(crate) security: Security,
     pub(crate) sink: Arc<dyn PacketSink>,
-    /// The trouble if the configured broker is not reached.
+    /// The trouble to record if the configured broker is unreachable.
     pub(crate) unreachable: TroubleKind,
     pub(crate) counters: Arc<Counters>,
     pub(crate) seed: u64,
@@ -127,7 +128,8 @@ impl Link {
             .is_some_and(|client| client.publish(topic, payload, retention))
     }
 
-    /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
+    /// Records a message whose echo is expected, even if there was no room to send it; true when
+    /// the broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
         let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
@@ -154,16 +156,16 @@ impl Drop for Link {
     }
 }
 
-/// Waits before the first attempts after a broken session. They find out soon whether the broker's process is gone: it
-/// may hold the port for a moment after its connections broke.
+/// Waits before the first attempts after a broken session. These attempts soon show whether the
+/// broker's process is gone: it may hold the port for a moment after its connections broke.
 const FIRST_RETRIES: [Duration; 3] = [
     Duration::ZERO,
     Duration::from_millis(5),
     Duration::from_millis(10),
 ];
 
-/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that ends every session would
-/// be tried without pause.
+/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that
+/// ends every session would be tried without pause.
 const MIN_SESSION: Duration = Duration::from_millis(200);
 
 struct LinkTask {
@@ -175,14 +177,14 @@ struct LinkTask {
     /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
-    /// True if the wrong clock of this machine was told.
+    /// True if the wrong clock of this machine was reported.
     has_reported_clock: bool,
 }
 
 impl LinkTask {
     async fn run(mut self, mut backoff: Backoff) {
-        // A session that outlived this was in use. One that ends sooner, such as by an oversized retained packet, must
-        // not be tried again at full speed.
+        // A session that lasted longer was in use. A session that ends sooner, for example because
+        // of an oversized retained packet, must not be repeated at full speed.
         let in_use = 2 * self.setup.config.connect_timeout();
         let mut checks = FIRST_RETRIES.iter();
         loop {
@@ -285,11 +287,12 @@ impl LinkTask {
         }) {
             return Ok(());
         }
-        // A working connection receives at least the answers to pings. Sent packets are no sign of life. A poll that
-        // takes longer than a keep-alive was stalled on this side.
+        // A working connection receives at least the answers to pings. Sent packets are not a sign
+        // of life. A poll that takes longer than a keep-alive was stalled on this side.
         let patience = 2 * config.keep_alive();
         let mut silent = Duration::ZERO;
-        // Time spent waiting for the own status. One wait alone, which may be a stall, is not enough for a verdict.
+        // Time spent waiting for this node's own status. A single wait may be a stall and is not
+        // enough for a verdict.
         let mut listened = Duration::ZERO;
         let mut heard_itself = false;
         loop {
@@ -336,7 +339,7 @@ impl LinkTask {
                     self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
                 Packet::Disconnected => return Ok(()),
-                // The return of the node's own status decides.
+                // Only the return of the node's own status is decisive.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
             if !heard_itself
@@ -348,7 +351,8 @@ impl LinkTask {
         }
     }
 
-    /// Notes that the configured broker is not reached. Others come and go with their nodes, which the election knows.
+    /// Records that the configured broker is unreachable. Other brokers come and go with their
+    /// nodes, which the election tracks.
     fn note_unreachable(&self, error: &ConnectionError) {
         let is_expected = self.setup.config.broker.as_ref() == Some(&self.broker);
         if is_expected
@@ -364,7 +368,7 @@ impl LinkTask {
         }
     }
 
-    /// Notes a refusal of the broker.
+    /// Records a refusal of the broker.
     fn report_refusal(&mut self, refusal: String) {
         let broker = self.broker.to_string();
         let cause = format!("broker refuses this node: {refusal}");
@@ -378,7 +382,7 @@ impl LinkTask {
         }
     }
 
-    /// Notes that the broker takes back a refusal for which `is_over` is true.
+    /// Records the end of a refusal for which `is_over` is true.
     fn end_refusal(&mut self, is_over: impl Fn(&str) -> bool) {
         if self
             .reported_refusal
@@ -390,7 +394,7 @@ impl LinkTask {
         }
     }
 
-    /// Sends to the gateway; false when it has ended.
+    /// Sends to the gateway; returns false if it has ended.
     fn tell(&self, change: LinkChange) -> bool {
         (self.report)(LinkEvent {
             link: self.id,
@@ -402,7 +406,7 @@ impl LinkTask {
 impl Drop for LinkTask {
     fn drop(&mut self) {
         self.end_refusal(|_| true);
-        // A link that is not wanted any more misses no broker.
+        // A link that is not wanted any more does not report its broker.
         self.setup
             .counters
             .troubles()
@@ -413,7 +417,8 @@ impl Drop for LinkTask {
 /// Prefix of refused logins.
 const NOT_ADMITTED: &str = "connection refused";
 
-/// Refusal that shows only by a missing echo: brokers acknowledge messages that they do not permit.
+/// Refusal that is only visible as a missing echo: brokers acknowledge messages that they do not
+/// permit.
 const NOT_HEARD: &str =
     "this node's own status does not come back: publishing or subscribing to it is not permitted";
 

@@ -1,11 +1,11 @@
-//! Packets that come in on a link, as their receiver takes them.
+//! Packets that arrive on a link, in the form for their receiver.
 
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use uuid::Uuid;
 
-/// The broker that passed a packet on.
+/// The broker that forwarded a packet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Via<'a> {
     pub(crate) address: &'a BrokerAddress,
@@ -16,7 +16,7 @@ pub(crate) struct Via<'a> {
 /// The effect of a packet on its link.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum PacketOutcome {
-    /// None.
+    /// No further effect.
     Done,
     /// The broker published this node's last will: the link must publish the status again.
     DeclaredOffline,

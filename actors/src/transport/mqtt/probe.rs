@@ -7,11 +7,11 @@ use super::connection::{Packet, open};
 use super::{BrokerAddress, Security};
 use crate::transport::pki::OBSERVER_MARK;
 
-/// Logs in as configured, as an observer of the node of this name, and disconnects. There is no last will, so that the
-/// cell notices nothing.
+/// Logs in as configured, as an observer of the node of this name, and disconnects. There is no
+/// last will, so the login is invisible to the cell.
 ///
 /// # Errors
-/// The reason in words: the broker is not reachable or refuses.
+/// Returns the reason as text: the broker is not reachable or refuses.
 pub async fn probe(
     address: &BrokerAddress,
     node: &str,

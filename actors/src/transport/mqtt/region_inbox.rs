@@ -1,4 +1,5 @@
-//! Incoming packets of the region: maps of the cells around, statuses of the own cell, and what cells say of vehicles.
+//! Incoming packets of the region: maps of the cells around, statuses of the own cell, and cells'
+//! counts about vehicles.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -49,7 +50,7 @@ pub(crate) struct RegionInbox {
     /// Deliveries that the uplink may still hold.
     capacity: Arc<Semaphore>,
     throttle: Mutex<KeyedThrottle<NodeName>>,
-    /// The same for what is said of vehicles.
+    /// Deliveries of counts about vehicles that the uplink may still hold.
     reputation_capacity: Arc<Semaphore>,
     reputation_throttle: Mutex<KeyedThrottle<NodeName>>,
 }
@@ -57,14 +58,17 @@ pub(crate) struct RegionInbox {
 /// Maximum maps that wait for the uplink: some seconds of all cells around.
 const CAPACITY: usize = 32;
 
-/// Maximum messages about vehicles that wait for the uplink. When a leader connects, all about the present ones come at once.
+/// Maximum number of messages about vehicles that wait for the uplink. When a leader connects, all
+/// messages about the present vehicles arrive at once.
 const REPUTATION_CAPACITY: usize = 1024;
 
-/// Maximum messages about vehicles per second of one cell that are decoded: one about each vehicle of a large cell.
+/// Maximum messages about vehicles per second of one cell that are decoded: one about each vehicle
+/// of a large cell.
 const MAX_REPUTATION_HZ: u32 = 512;
 
 impl RegionInbox {
-    /// Takes what the region tells the cell, whose origin is in the tile, in this run of the node.
+    /// Creates an inbox for messages of the region to the cell with its origin in the tile, in this
+    /// run of the node.
     pub(crate) fn new(
         (cell, tile): (NodeName, Quadkey),
         run: Uuid,
@@ -128,7 +132,7 @@ impl RegionInbox {
         Ok(PacketOutcome::Done)
     }
 
-    /// Reads what a cell says of a vehicle; one that was deleted says nothing.
+    /// Decodes a cell's counts about a vehicle; a deleted message counts as empty.
     fn read_reputation(
         &self,
         topic: &ReputationTopic,
@@ -188,7 +192,8 @@ impl RegionInbox {
 }
 
 impl PacketSink for RegionInbox {
-    /// Processes one packet of the region's broker. A payload that cannot be used is counted by its reason and cell.
+    /// Processes one packet of the region's broker. A payload that cannot be used is counted by its
+    /// reason and cell.
     fn accept(
         &self,
         via: Via<'_>,

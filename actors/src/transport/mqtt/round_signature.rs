@@ -1,7 +1,8 @@
-//! Signatures of leaders under their rounds, so that these can be taken over the broker of another node.
+//! Signatures of leaders on their rounds, with which receivers can accept the rounds over another
+//! node's broker.
 //!
-//! The signature is the last field of the payload, [`FIELD`], in any encoding. It covers all bytes before its value and the
-//! topic. Receivers that do not know it ignore the field.
+//! The signature is the last field of the payload, [`FIELD`], in any encoding. It covers all bytes
+//! before its value and the topic. Receivers of earlier versions ignore the field.
 //!
 //! ```text
 //! JSON     {…,"signature":" | base64 | "}
@@ -15,7 +16,7 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 /// Name of the field.
 const FIELD: &str = "signature";
 
-/// Place of the field in the compact encoding of every round, beyond those of all other fields.
+/// Place of the field in the compact encoding of every round, after the places of all other fields.
 const PLACE: u8 = 15;
 
 /// First byte of CBOR maps and arrays; the low bits hold a count of up to [`MAX_COUNT`].
@@ -40,7 +41,8 @@ pub(super) fn statement(topic: &[u8], signed: &[u8]) -> Vec<u8> {
     [LABEL, &(topic.len() as u64).to_be_bytes(), topic, signed].concat()
 }
 
-/// Appends a signature to a round's payload. `None` if `sign` gives none, or the payload is not one of a round.
+/// Appends a signature to a round's payload. `None` if `sign` returns none, or the payload does not
+/// belong to a round.
 pub(super) fn append(
     payload: &[u8],
     sign: impl FnOnce(&[u8]) -> Option<Vec<u8>>,

@@ -19,7 +19,7 @@ use crate::transport::pki::{
     BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker, is_signed_by,
 };
 
-/// Protection of links and payloads; by default there is none.
+/// Protection of links and payloads; by default they are unprotected.
 #[derive(Debug, Clone, Default)]
 pub struct Security {
     /// The node's certificates, for the brokers of the cell.
@@ -53,7 +53,7 @@ impl Security {
     /// Reads the certificates of the node that `tls` names, and the key of the cell.
     ///
     /// # Errors
-    /// [`SecurityError`] naming the file.
+    /// Returns a [`SecurityError`] that names the file.
     pub fn load(
         tls: Option<(&TlsConfig, &NodeName)>,
         mqtt: &MqttConfig,
@@ -86,7 +86,7 @@ impl Security {
     /// The protection of the connection to the region's broker, with the node's own certificate.
     ///
     /// # Errors
-    /// When the file of the CA cannot be used.
+    /// Returns an error if the file of the CA cannot be used.
     pub fn of_uplink(
         &self,
         broker: BrokerAddress,
@@ -106,7 +106,8 @@ impl Security {
         Ok(security)
     }
 
-    /// The same protection for a node that knows the others: it verifies their signatures under rounds.
+    /// The same protection for a node with a list of members: it verifies their signatures on
+    /// rounds.
     pub fn with_members(self, members: watch::Receiver<Vec<Member>>) -> Self {
         Self {
             members: Some(members),
@@ -117,7 +118,7 @@ impl Security {
     /// TLS for one connection to a broker; `None` for plaintext.
     ///
     /// # Errors
-    /// When the credentials can no longer be used.
+    /// Returns an error if the credentials have become unusable.
     pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self
             .external
@@ -139,8 +140,8 @@ impl Security {
         }
     }
 
-    /// The reason for which this machine's clock makes every connection by certificate fail, and the remedy. Such
-    /// connections are tried on and on, and succeed once the clock is set.
+    /// The reason for which this machine's clock makes every connection by certificate fail, and
+    /// the remedy. Such connections are retried, and succeed once the clock is set.
     pub fn clock_fault(&self) -> Option<String> {
         let credentials = self.credentials.as_ref()?.current();
         let (wall, begins, expires) = (
@@ -219,7 +220,8 @@ impl Security {
         }
     }
 
-    /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
+    /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz
+    /// targets.
     #[cfg(fuzzing)]
     pub fn rejects_forgery(&self, topic: &str, bytes: &[u8]) -> bool {
         let Some(key) = &self.signing else {
@@ -239,10 +241,10 @@ impl Security {
     }
 }
 
-/// Key that signs payloads for brokers which others use too.
+/// Key that signs payloads for brokers that other parties use too.
 ///
-/// The signature is HMAC-SHA256 over the length of the topic, the topic and the payload. The key is derived from the
-/// cell's key.
+/// The signature is HMAC-SHA256 over the length of the topic, the topic and the payload. The key is
+/// derived from the cell's key.
 ///
 /// ```text
 /// | ec | tag (32) | payload |

@@ -15,8 +15,8 @@ pub enum SubscriptionRole {
 pub(crate) const REPORTS: [&str; 2] = ["detections/+", "vote_detections/+"];
 
 impl SubscriptionRole {
-    /// All filters of the role, below the cell's root. Reports come last: without them, the other filters keep their
-    /// index, by which a SUBACK refers to them.
+    /// All filters of the role, below the cell's root. Reports come last: without them, the other
+    /// filters keep their index, by which a SUBACK refers to them.
     pub(crate) fn filters(self) -> &'static [&'static str] {
         match self {
             Self::Follower => &[

@@ -1,4 +1,5 @@
-//! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA and revocation list.
+//! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA
+//! and revocation list.
 
 use std::time::Duration;
 
@@ -16,7 +17,7 @@ use super::{CertificateSubject, InvalidCertificate, LoadedCredentials};
 /// Largest certificate in DER that fits a handshake's datagram.
 pub(crate) const MAX_CERTIFICATE_BYTES: usize = 840;
 
-/// Why a certificate proves no node of the cell.
+/// The reason why a certificate proves no node of the cell.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum Distrust {
     /// Not of the cell's CA, not valid now, revoked, or not for clients.
@@ -40,7 +41,8 @@ impl LoadedCredentials {
         self.signer.sign(message)
     }
 
-    /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not revoked.
+    /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not
+    /// revoked.
     pub(crate) fn verify_node(
         &self,
         certificate: &[u8],
@@ -53,7 +55,8 @@ impl LoadedCredentials {
         verified.map(|_| subject).map_err(Distrust::Untrusted)
     }
 
-    /// True if the cell's CA has revoked a certificate, which may have expired, or the city that CA.
+    /// True if the cell's CA has revoked a certificate, which may have expired, or the city has
+    /// revoked the cell's CA.
     pub(crate) fn has_revoked(&self, certificate: &[u8]) -> bool {
         if self
             .revoked_cas
@@ -90,7 +93,7 @@ pub(super) fn is_issued_by(ca: &[u8], certificate: &[u8]) -> bool {
         && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
 }
 
-/// True if a revocation list is one of a CA, which has signed it by ECDSA over P-256 with SHA-256.
+/// True if a revocation list was issued by a CA, which signs it by ECDSA over P-256 with SHA-256.
 pub(super) fn is_list_of(ca: &[u8], list: &[u8]) -> bool {
     let (Ok((_, ca)), Ok((_, list))) = (
         X509Certificate::from_der(ca),

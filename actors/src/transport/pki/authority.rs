@@ -1,4 +1,5 @@
-//! The certificate authority of a cell or city: a directory on one machine, which need not belong to the cell.
+//! The certificate authority of a cell or city: a directory on one machine, which need not belong
+//! to the cell.
 
 mod city;
 
@@ -23,13 +24,14 @@ use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
 use crate::platform::bounded_file;
 use crate::platform::state_file::{content, replace_file, with_checksum};
 
-/// Days for which a node's certificate is valid unless told otherwise.
+/// Default validity of a node's certificate in days.
 pub const DEFAULT_DAYS: u32 = 365;
 
 /// Days for which a CA is valid.
 const CA_DAYS: u32 = 3650;
 
-/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be behind.
+/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be
+/// behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
 /// The CA of one cell, or of a city above cells, and its register of certificates.
@@ -62,13 +64,13 @@ struct IssuedCertificate {
     revoked_at_us: Option<Timestamp>,
 }
 
-/// An error of the authority; the files before it are still there.
+/// An error of the authority; the previous files remain.
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
     /// A file could not be read or written.
     #[error("cannot use {path}")]
     File {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
@@ -79,7 +81,7 @@ pub enum AuthorityError {
     /// The directory has a CA already, whose certificates would become invalid.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
-    /// The CA of a cell where that of a city is needed, or the other way round.
+    /// The CA of a cell where a city's CA is needed, or the reverse.
     #[error("{directory} has the CA of a {found}: {remedy}")]
     Kind {
         /// The directory.
@@ -92,7 +94,7 @@ pub enum AuthorityError {
     /// The register cannot be read.
     #[error("{path} cannot be used: {reason}; put a copy of it back")]
     Register {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The error.
         reason: String,
@@ -118,7 +120,7 @@ impl Authority {
     /// Makes a CA for a cell in a directory, which is made too, with an empty revocation list.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    /// Returns an [`AuthorityError`] if there is a CA or the directory cannot be written.
     pub fn init(directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
         let parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
         Self::make(directory, cell, false, now, |key| {
@@ -165,7 +167,7 @@ impl Authority {
     /// Opens the CA of a directory.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is none.
+    /// Returns an [`AuthorityError`] if there is no CA.
     pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
         Ok(Self {
             directory: directory.into(),
@@ -173,7 +175,8 @@ impl Authority {
         })
     }
 
-    /// Lock of the directory for a change, with the register as it is now: another command may have changed it.
+    /// Lock of the directory for a change, with the register as it is now: another command may have
+    /// changed it.
     fn lock(&mut self) -> Result<File, AuthorityError> {
         let path = self.directory.join(LOCK);
         let locked = File::create(&path).and_then(|file| file.lock().map(|()| file));
@@ -182,12 +185,13 @@ impl Authority {
         Ok(lock)
     }
 
-    /// Makes a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`. Earlier ones are
-    /// overwritten, and stay valid until they expire or are revoked. In the election the node can declare no more than
-    /// `rights`.
+    /// Creates a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`.
+    /// Earlier ones are overwritten, and stay valid until they expire or are revoked. In the
+    /// election the node cannot declare more than `rights`.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    /// Returns an [`AuthorityError`] if the name cannot have a certificate or a file cannot be
+    /// written.
     pub fn issue(
         &mut self,
         node: &NodeName,
@@ -202,11 +206,11 @@ impl Authority {
         write(&nodes.join(format!("{node}.pem")), &certificate)
     }
 
-    /// Certificate in PEM for a key that stays with the node, with the same rights as [`Authority::issue`], and its serial
-    /// number in hexadecimal digits.
+    /// Certificate in PEM for a key that stays with the node, with the same rights as
+    /// [`Authority::issue`], and its serial number in hexadecimal digits.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    /// Returns an [`AuthorityError`] if the name cannot have one or a file cannot be written.
     pub(crate) fn certify(
         &mut self,
         node: &NodeName,
@@ -256,7 +260,8 @@ impl Authority {
         Ok((certificate.pem(), serial))
     }
 
-    /// Registers a certificate before anyone has it, so that every valid certificate can be revoked.
+    /// Registers a certificate before anyone has it, so that every valid certificate can be
+    /// revoked.
     fn record(
         &mut self,
         issued: IssuedCertificate,
@@ -273,7 +278,7 @@ impl Authority {
         &self.register.cell
     }
 
-    /// True if a node has a certificate that is neither revoked nor expired.
+    /// True if a node has a certificate that is valid: not revoked and not expired.
     pub(crate) fn has_certificate(&self, node: &NodeName, now: Timestamp) -> bool {
         let is_valid = |issued: &IssuedCertificate| {
             issued.revoked_at_us.is_none() && issued.expires_at_us > now
@@ -284,11 +289,12 @@ impl Authority {
             .any(|issued| issued.node == *node && is_valid(issued))
     }
 
-    /// Revokes all certificates of a node, also those that have expired, and rewrites the revocation list; returns their
-    /// number. Evidence that was signed in a certificate's time counts after it, until it is revoked.
+    /// Revokes all certificates of a node, including expired ones, and rewrites the revocation
+    /// list; returns their number. Evidence that was signed while a certificate was valid counts
+    /// after its expiry, until it is revoked.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there are none or the list cannot be written.
+    /// Returns an [`AuthorityError`] if there are no certificates or the list cannot be written.
     pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
         match self.revoke_where(|issued| issued.node == *node && !issued.is_ca, now)? {
             0 => Err(AuthorityError::NotIssued(node.clone())),
@@ -392,7 +398,7 @@ impl Authority {
 /// Checks that a node may have a certificate under the name.
 ///
 /// # Errors
-/// [`AuthorityError::Name`] when it is one of an observer.
+/// Returns [`AuthorityError::Name`] if the name belongs to an observer.
 pub(crate) fn check_name(node: &NodeName) -> Result<(), AuthorityError> {
     if node.as_str().contains(OBSERVER_MARK) {
         Err(AuthorityError::Name(node.clone()))
@@ -420,7 +426,7 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
     register.map_err(|reason| AuthorityError::Register { path, reason })
 }
 
-/// Parameters of a CA's certificate with so many CAs below it in a row.
+/// Parameters of a CA's certificate with a maximum number of CAs below it in a chain.
 fn ca_parameters(
     name: &str,
     below: u8,

@@ -1,4 +1,5 @@
-//! Verification of a broker's certificate for as long as a connection lasts, not only in the handshake.
+//! Verification of a broker's certificate for as long as a connection lasts, not only in the
+//! handshake.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -49,7 +50,8 @@ impl BrokerIdentity {
 const RECHECK_INTERVAL: Duration = Duration::from_secs(30);
 
 impl BrokerTrust {
-    /// Trust by a verifier, for a certificate with `name`, or else with the host name of the connection.
+    /// Trust by a verifier, for a certificate with `name`, or otherwise with the host name of the
+    /// connection.
     pub(super) fn new(
         client: &ClientConfig,
         verifier: Arc<dyn ServerCertVerifier>,
@@ -69,7 +71,7 @@ impl BrokerTrust {
         }
     }
 
-    /// Trust in brokers of the cell, by the present content of the node's files.
+    /// Trust in brokers of the cell, based on the current content of the node's files.
     pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
         let current = credentials.current();
         let trust = Self::new(
@@ -83,9 +85,9 @@ impl BrokerTrust {
         }
     }
 
-    /// Trust in the door of the node whose certificates these are.
+    /// Trust in the local broker of the node with these certificates.
     ///
-    /// The certificate is verified in the handshake alone: programs connect for a moment.
+    /// The certificate is only verified in the handshake, because programs connect for a moment.
     pub fn of_door(credentials: &Credentials) -> Self {
         let current = credentials.current();
         Self::new(
@@ -100,7 +102,7 @@ impl BrokerTrust {
         Arc::clone(&self.client)
     }
 
-    /// The broker's own name, to be asked for after the handshake.
+    /// The broker's own name, available after the handshake.
     pub fn identity(&self) -> BrokerIdentity {
         BrokerIdentity(
             self.reloaded_from
@@ -109,7 +111,7 @@ impl BrokerTrust {
         )
     }
 
-    /// Waits until the broker's certificate is no longer valid; the result is the reason.
+    /// Waits until the broker's certificate becomes invalid; returns the reason.
     pub async fn invalidated(mut self) -> rustls::Error {
         loop {
             match &self.reloaded_from {
@@ -161,7 +163,7 @@ impl RecordingVerifier {
         }
     }
 
-    /// Verifies again what was shown, if anything was.
+    /// Verifies the presented certificate again, if there is one.
     fn check(&self, verifier: &dyn ServerCertVerifier) -> Result<(), rustls::Error> {
         let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let Some((chain, name)) = &*chain else {
@@ -185,7 +187,7 @@ impl ServerCertVerifier for RecordingVerifier {
         ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
-        // A certificate of the cell is directly signed by a CA that the node knows.
+        // A certificate of the cell is directly signed by a CA of the node's files.
         let (name, intermediates) = match &self.name {
             Some(name) => (name, &[][..]),
             None => (name, intermediates),
@@ -301,7 +303,7 @@ mod tests {
         let known = credentials.current();
         authority.revoke(&edge, clock::now()).unwrap();
         credentials.changed(&known).await;
-        // All wait in this thread: each gets its turn before the list could be read again.
+        // All of them wait in this thread: each gets its turn before the list could be read again.
         for _ in 0..100 {
             tokio::task::yield_now().await;
         }

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use ecod::config::ConfigError;
 use serde::{Deserialize, Serialize};
 
-/// The files that `ecod-node pki` made for a node, in PEM. They are read again when they change, without a restart.
+/// The files that `ecod-node pki` made for a node, in PEM. They are read again when they change,
+/// without a restart.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TlsConfig {
@@ -15,11 +16,11 @@ pub struct TlsConfig {
     pub certificate: PathBuf,
     /// The private key of the certificate. Only the node's user should be able to read it.
     pub key: PathBuf,
-    /// The CA's revocation list; default none: a certificate is then valid until it expires.
+    /// The CA's revocation list; default: not set, a certificate is then valid until it expires.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub revocation_list: Option<PathBuf>,
-    /// The city above the cell; default none. The city's CA has signed that of the cell, and vehicles that it certifies itself
-    /// take part in every cell of the city.
+    /// The city above the cell; default: not set. The city's CA has signed the cell's CA, and
+    /// vehicles that it certifies directly may join every cell of the city.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub city: Option<CityTlsConfig>,
 }
@@ -39,7 +40,7 @@ impl TlsConfig {
     /// Checks that every path is given; the files are read when the node starts.
     ///
     /// # Errors
-    /// [`ConfigError`] with the key, the value and what is allowed.
+    /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let list = self
             .revocation_list
@@ -65,7 +66,7 @@ impl TlsConfig {
                 return Err(ConfigError::new(key, "nothing", "the path of a PEM file"));
             }
         }
-        // Where there is any list, certificates of a CA without one are refused.
+        // If there is any list, certificates of a CA without a list are refused.
         match (list, city_list) {
             (None, Some(_)) => Err(ConfigError::new(
                 "revocation_list",

@@ -1,4 +1,4 @@
-//! The certificates of one node, and the verifiers of others' certificates.
+//! The certificates of one node, and the verifiers of other nodes' certificates.
 
 mod city_trust;
 mod issuers;
@@ -56,8 +56,8 @@ struct CachedCredentials {
 pub struct LoadedCredentials {
     /// The node's own certificate.
     pub identity: CertificateSubject,
-    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A resumed session would
-    /// not be checked against the revocation list.
+    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A
+    /// resumed session would not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
     /// TLS of connections to brokers of the cell.
     pub client: Arc<ClientConfig>,
@@ -66,7 +66,7 @@ pub struct LoadedCredentials {
     /// Verifier of certificates of the cell's brokers, which have `broker_name` at any address.
     pub(super) brokers: Arc<dyn ServerCertVerifier>,
     pub(super) broker_name: ServerName<'static>,
-    /// Verifier of certificates of nodes' doors.
+    /// Verifier of certificates of nodes' local brokers.
     pub(super) doors: Arc<dyn ServerCertVerifier>,
     issuers: Arc<Issuers>,
     pub(super) certificates: Vec<CertificateDer<'static>>,
@@ -85,7 +85,7 @@ pub enum CredentialsError {
     File {
         /// The configuration key that names the file.
         key: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The error.
         reason: String,
@@ -93,7 +93,7 @@ pub enum CredentialsError {
     /// The certificate names another node.
     #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
     WrongName {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The node that it names.
         found: NodeName,
@@ -106,7 +106,7 @@ pub enum CredentialsError {
          {path} allows at most {allowed}; issue one by `ecod-node pki issue {node} --role {role} --priority {priority}`"
     )]
     Overreached {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// This node.
         node: NodeName,
@@ -129,10 +129,11 @@ const RELOAD_INTERVAL: Duration = Duration::from_millis(500);
 const MAX_PEM_BYTES: u64 = 16 * 1024 * 1024;
 
 impl LoadedCredentials {
-    /// The node that a certificate names, and its rights if the cell has issued it. Its validity is verified elsewhere.
+    /// The node that a certificate names, and its rights if the cell has issued it. Its validity is
+    /// verified elsewhere.
     ///
     /// # Errors
-    /// [`InvalidCertificate`] when it names no node.
+    /// Returns an [`InvalidCertificate`] if it names no node.
     pub(crate) fn subject_of(
         &self,
         certificate: &[u8],
@@ -145,7 +146,7 @@ impl Credentials {
     /// Reads a node's files.
     ///
     /// # Errors
-    /// [`CredentialsError`] naming the file.
+    /// Returns a [`CredentialsError`] that names the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
         let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
         let cache = Mutex::new(CachedCredentials {
@@ -161,10 +162,10 @@ impl Credentials {
         })
     }
 
-    /// Checks that the node's certificate allows what the node is configured to be.
+    /// Checks that the node's certificate allows its configured role and priority.
     ///
     /// # Errors
-    /// [`CredentialsError::Overreached`] naming both.
+    /// Returns [`CredentialsError::Overreached`] with both.
     pub fn check_rights(&self, role: Role, priority: u8) -> Result<(), CredentialsError> {
         let rights = self.current().identity.rights_of(&self.node);
         if rights.allow(role, priority) {
@@ -180,12 +181,14 @@ impl Credentials {
         })
     }
 
-    /// True if the node's certificate is an operator's, so that the cell's description may be set here.
+    /// True if the node's certificate is an operator's, so that the cell's description may be set
+    /// here.
     pub fn may_describe(&self) -> bool {
         self.current().identity.rights_of(&self.node).may_describe
     }
 
-    /// The present content of the files. While they are unusable, which is logged, the content before.
+    /// The current content of the files. While they are unusable, which is logged, the previous
+    /// content.
     pub fn current(&self) -> Arc<LoadedCredentials> {
         let mut cache = self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         if cache.checked_at.elapsed() >= RELOAD_INTERVAL {
@@ -206,8 +209,8 @@ impl Credentials {
         Arc::clone(&cache.current)
     }
 
-    /// Waits until the content of the files is another than `known`: half a second at most from its change. All that wait
-    /// learn it at once.
+    /// Waits until the content of the files differs from `known`: half a second at most after the
+    /// change. All waiting tasks are notified at once.
     pub async fn changed(&self, known: &Arc<LoadedCredentials>) -> Arc<LoadedCredentials> {
         loop {
             let changed = self.changed.notified();
@@ -215,7 +218,8 @@ impl Credentials {
             if !Arc::ptr_eq(&current, known) {
                 return current;
             }
-            // Others look at the files, too: half a second after the last look the next one is due.
+            // Other tasks check the files, too: the next check is due half a second after the last
+            // one.
             let since = self
                 .cache
                 .lock()
@@ -230,11 +234,11 @@ impl Credentials {
     }
 }
 
-/// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the configured host name.
-/// The node presents its own certificate, if it has one.
+/// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the
+/// configured host name. The node presents its own certificate, if it has one.
 ///
 /// # Errors
-/// [`CredentialsError`] naming the file.
+/// Returns a [`CredentialsError`] that names the file.
 pub fn external_broker(
     (key, ca): (&'static str, &Path),
     own: Option<&LoadedCredentials>,
@@ -345,7 +349,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     })
 }
 
-/// The node that a certificate names, and the rights that count.
+/// The node that a certificate names, and its effective rights.
 fn subject_of(
     issuers: &Issuers,
     certificate: &[u8],
@@ -385,7 +389,8 @@ fn authorities(
     }
 }
 
-/// Reads revocation lists. A file without any, such as one copied by half, is an error and not an empty list.
+/// Reads revocation lists. A file without any, for example one that was copied incompletely, is an
+/// error and not an empty list.
 fn lists(
     key: &'static str,
     path: &Path,

@@ -1,4 +1,4 @@
-//! Signatures of aggregators under their evidence, which other nodes pass on.
+//! Signatures of aggregators on their evidence, which other nodes pass on.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ pub struct EvidenceSigner {
     credentials: Arc<Credentials>,
     /// The content of the files that the certificates below were verified with.
     loaded: Arc<LoadedCredentials>,
-    /// Verified certificates by their base64; `None` for those that are refused.
+    /// Verified certificates by their base64; `None` for refused certificates.
     known: BTreeMap<String, Option<Signatory>>,
 }
 
@@ -33,16 +33,16 @@ struct Signatory {
     public_key: Vec<u8>,
 }
 
-/// The reason why evidence does not count as its aggregator's.
+/// The reason why evidence is not attributed to its aggregator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EvidenceError {
     /// No signature.
     #[error("evidence without a signature")]
     Unsigned,
-    /// Not one of this cell, revoked, or expired.
+    /// The certificate is not from this cell, revoked, or expired.
     #[error("the certificate beside the evidence is not a valid one of this cell")]
     Certificate,
-    /// The certificate of another node than the aggregator, or of one that may not lead.
+    /// The certificate belongs to a node other than the aggregator, or to a node that may not lead.
     #[error("evidence signed by another than its aggregator")]
     Signatory,
     /// The signature is of other bytes or by another key.
@@ -50,7 +50,7 @@ pub enum EvidenceError {
     Signature,
 }
 
-/// Maximum number of certificates that are remembered; beyond it all are verified again.
+/// Maximum number of stored certificates; when it is exceeded, all are verified again.
 const MAX_KNOWN: usize = 256;
 
 impl EvidenceSigner {
@@ -65,7 +65,7 @@ impl EvidenceSigner {
         }
     }
 
-    /// Signs a share of the node's own counts. `None` if the system gives no random numbers.
+    /// Signs a share of the node's own counts. `None` if the system provides no random numbers.
     pub fn sign(&self, share: LedgerShare) -> Option<LedgerShare> {
         let loaded = self.credentials.current();
         let signature = BASE64.encode(loaded.sign(&share.signed_bytes(&self.cell)).ok()?);
@@ -81,7 +81,7 @@ impl EvidenceSigner {
         BASE64.encode(self.loaded.certificate())
     }
 
-    /// True if a certificate is one of the cell and not revoked; it may have expired.
+    /// True if a certificate belongs to the cell and is not revoked; it may have expired.
     pub fn is_of_cell(&mut self, certificate: &str) -> bool {
         self.known(certificate).is_some()
     }
@@ -100,7 +100,8 @@ impl EvidenceSigner {
     /// Verifies a share that was received.
     ///
     /// # Errors
-    /// [`EvidenceError`] unless the share's aggregator signed it, with a valid certificate of a node that may lead.
+    /// Returns an [`EvidenceError`] unless the share's aggregator signed it, with a valid
+    /// certificate of a node that may lead.
     pub fn verify(&mut self, share: &LedgerShare) -> Result<(), EvidenceError> {
         let signatory = self.signatory(share)?;
         // Before the certificate begins, this machine's clock is wrong.
@@ -113,16 +114,16 @@ impl EvidenceSigner {
         self.verify_signature(share, &signatory)
     }
 
-    /// Verifies a share that was taken before: its certificate may have expired since.
+    /// Verifies a share that was accepted before: its certificate may have expired since.
     ///
     /// # Errors
-    /// [`EvidenceError`], in particular when the certificate was revoked.
+    /// Returns an [`EvidenceError`], in particular if the certificate was revoked.
     pub fn verify_again(&mut self, share: &LedgerShare) -> Result<(), EvidenceError> {
         let signatory = self.signatory(share)?;
         self.verify_signature(share, &signatory)
     }
 
-    /// True if the certificate of a share that was verified is still one of the cell and not revoked.
+    /// True if the certificate of a verified share still belongs to the cell and is not revoked.
     pub fn is_trusted(&mut self, share: &LedgerShare) -> bool {
         self.signatory(share).is_ok()
     }
@@ -160,7 +161,7 @@ impl EvidenceSigner {
         self.known.get(certificate).cloned().flatten()
     }
 
-    /// The aggregator whose counts a share has, by the certificate beside them.
+    /// The aggregator whose counts a share contains, according to the certificate in it.
     fn signatory(&mut self, share: &LedgerShare) -> Result<Signatory, EvidenceError> {
         let certificate = &share
             .signed
@@ -179,8 +180,8 @@ impl EvidenceSigner {
     }
 }
 
-/// The holder of a certificate, if the cell's CA issued it and has not revoked it. The caller checks that it has not
-/// expired.
+/// The holder of a certificate, if the cell's CA issued it and has not revoked it. The caller
+/// checks that it has not expired.
 fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory> {
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
     let subject = loaded.subject_of(&certificate).ok()?;

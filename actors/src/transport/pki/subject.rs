@@ -22,13 +22,13 @@ pub struct CertificateSubject {
     expires: Timestamp,
 }
 
-/// A certificate that names no node.
+/// Error for a certificate that names no node.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidCertificate {
     /// Not an X.509 certificate.
     #[error("not an X.509 certificate")]
     Malformed,
-    /// Not exactly one common name, or one that is not a node's name.
+    /// The certificate has no common name, several ones, or one that is not a node's name.
     #[error("the certificate's common name is not the name of a node")]
     NoName,
     /// Role and priority that cannot be understood.
@@ -40,7 +40,7 @@ impl CertificateSubject {
     /// Reads a certificate in DER.
     ///
     /// # Errors
-    /// [`InvalidCertificate`] when it names no node.
+    /// Returns an [`InvalidCertificate`] if it names no node.
     pub fn of(certificate: &[u8]) -> Result<Self, InvalidCertificate> {
         let (_, parsed) =
             X509Certificate::from_der(certificate).map_err(|_| InvalidCertificate::Malformed)?;
@@ -100,13 +100,13 @@ impl CertificateSubject {
         self.begins
     }
 
-    /// Highest role and priority of the node in the election. A certificate of a version that wrote none allows all, if
-    /// it is one of a broker.
+    /// Highest role and priority of the node in the election. A certificate of an early version
+    /// without them allows all, if it is a broker's certificate.
     pub fn rights(&self) -> Rights {
         self.rights
     }
 
-    /// The same node as one that neither leads nor serves a broker.
+    /// The same node without the rights to lead and to serve a broker.
     #[must_use]
     pub(super) fn without_rights(self) -> Self {
         Self {
@@ -116,7 +116,7 @@ impl CertificateSubject {
         }
     }
 
-    /// Rights of a node or observer that uses the certificate. An observer never leads.
+    /// Rights of a node or observer that uses the certificate. An observer cannot lead.
     pub fn rights_of(&self, name: &NodeName) -> Rights {
         if *name == self.name {
             self.rights
@@ -130,8 +130,9 @@ impl CertificateSubject {
         self.expires
     }
 
-    /// True if the node may have a client of this name: its own, or that of a part or an observer which shares its
-    /// certificate. What parts see counts as their node's, so that one certificate is one vehicle.
+    /// True if the node may have a client of this name: its own name, or the name of a part or an
+    /// observer that shares its certificate. Parts' observations count as their node's, so that one
+    /// certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str())
             .is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))

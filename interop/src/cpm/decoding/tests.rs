@@ -1,4 +1,4 @@
-//! Messages of other stations, made of ETSI's types and not by the encoder here.
+//! Messages of other stations, made of ETSI's types without the encoder of this crate.
 
 #![allow(clippy::indexing_slicing, clippy::unwrap_used)]
 
@@ -29,7 +29,7 @@ fn coordinate(value: i32, confidence: u16) -> cdd::CartesianCoordinateWithConfid
     }
 }
 
-/// An object 10 m east and 20 m north, measured at the reference time, of which nothing else is said.
+/// An object 10 m east and 20 m north, measured at the reference time, without optional fields.
 fn object() -> cdd::PerceivedObject {
     let (x_coordinate, y_coordinate) = (coordinate(1000, 196), coordinate(2000, 98));
     let position = cdd::CartesianPosition3dWithConfidence {
@@ -59,7 +59,7 @@ fn object() -> cdd::PerceivedObject {
     object
 }
 
-/// The same, with more said of it.
+/// The same object with a change.
 fn with(change: impl FnOnce(&mut cdd::PerceivedObject)) -> cdd::PerceivedObject {
     let mut object = object();
     change(&mut object);
@@ -216,7 +216,8 @@ fn a_measurement_before_the_reference_time_is_moved_ahead_to_it() {
         let object = only(moving(delta_ms));
         assert_near([object.x_m, object.y_m], place, 1e-6);
     }
-    // An own guess of the station is none of its measurements; the ends of the range also stand for all beyond.
+    // An extrapolation of the station is not a measurement; the ends of the range also stand for
+    // all values beyond.
     let old = received(vec![
         moving(-1001),
         moving(-1000),
@@ -245,7 +246,7 @@ fn velocity_may_be_polar_and_codes_of_it_are_no_values() {
         cartesian(-16_383, 0, 127),
         cartesian(0, 16_382, 127),
         cartesian(16_383, 0, 127),
-        // Of a confidence out of range the standard says that the value is not valid.
+        // A confidence out of range means that the value is not valid (by the standard).
         cartesian(100, 0, 126),
     ];
     for code in codes {

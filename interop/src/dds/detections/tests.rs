@@ -253,7 +253,8 @@ fn a_camera_that_moves_is_where_it_was_at_the_stamp() {
         let (at, pose) = pose_in_map(&pose_at("map", seconds, x, yaw_rad)).unwrap();
         assert!(poses.push(at, pose));
     }
-    // 5 µs after the second pose, at 200 m/s; the pose of the settings is that of no camera that moves.
+    // 5 µs after the second pose, at 200 m/s; the pose in the settings does not apply to a moving
+    // camera.
     let moving = RosCamera {
         pose: Some(Pose::new(99.0, 99.0, 0.0)),
         ..camera()

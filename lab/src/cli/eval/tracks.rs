@@ -1,4 +1,4 @@
-//! Objects that move, judged by where they were.
+//! Evaluation of moving objects by their true positions.
 
 use std::collections::BTreeSet;
 use std::io::BufRead;
@@ -30,7 +30,7 @@ pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> 
     judge_maps(arguments, TrackEvaluation::new(truth), None)
 }
 
-/// Judges by the truth in files of a benchmark: maps, or files of the same form.
+/// Evaluates maps, or files in a benchmark's form, by the truth in files of that benchmark.
 pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
     let EvalArguments {
         truth: path,
@@ -102,7 +102,8 @@ fn is_of_maps(input: &Path) -> Result<bool, Failure> {
     Ok(begin.trim_ascii_start().starts_with(b"{"))
 }
 
-/// Judges maps. Those of `sequences`, which only their number tells apart, must be of as many.
+/// Evaluates maps. Maps of `sequences` are assigned to their sequence by number only, so the
+/// numbers of sequences must be equal.
 fn judge_maps(
     arguments: &EvalArguments,
     mut evaluation: TrackEvaluation,

@@ -1,4 +1,5 @@
-//! `ecod-lab testbed` with recorded detections: the recording, and scenes generated from what its detectors confuse.
+//! `ecod-lab testbed` with recorded detections: the recording, and scenes generated from its
+//! detectors' confusions.
 
 use std::fs;
 
@@ -49,7 +50,7 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
         results.push(intersection::run(RECORDING, &recording)?);
     }
     if is_chosen(GENERATED) {
-        // Losses of the recording are news, those of its copies are not.
+        // Losses of the recording are reported, losses of its copies are not.
         let generate = || generated(arguments, &recording);
         results.extend(tracing::subscriber::with_default(
             NoSubscriber::new(),
@@ -67,7 +68,8 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     if let Some(out) = &arguments.out {
         write_json(out, &Results { scenes: &results })?;
     }
-    // Generated scenes are harder than the recording: they are held to the bar only by themselves.
+    // Generated scenes are harder than the recording: the limit applies to them only if they are
+    // run alone.
     let least = arguments.at_least.unwrap_or(0.0);
     match results.first() {
         Some(scene) if scene.vote_accuracy_pct < least => Err(anyhow::anyhow!(

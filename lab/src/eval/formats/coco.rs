@@ -1,7 +1,8 @@
 //! COCO (Lin et al., arXiv 1405.0312): a dataset with annotations, or the results of a detector.
 //!
-//! A dataset has `images`, `categories` and `annotations`; results are a list of what takes the place of annotations, with scores, and
-//! their categories are COCO's own. Crowds are left out. An identity is a `track_id`, or an `instance_id`, as extensions for videos have.
+//! A dataset has `images`, `categories` and `annotations`; results are a list of entries in place
+//! of the annotations, with scores, and their categories are COCO's own. Crowds are left out. An
+//! identity is a `track_id` or `instance_id`, as in extensions for videos.
 
 use anyhow::{Context, bail};
 use ecod::model::detection::BoundingBox;
@@ -127,7 +128,7 @@ pub(super) fn frames(text: &str, has_camera: bool) -> anyhow::Result<ParsedFrame
     Ok(frames)
 }
 
-/// Names the path of what cannot be read.
+/// Names the path of the unreadable part.
 fn parsed<T: DeserializeOwned>(text: &str) -> anyhow::Result<T> {
     Ok(serde_path_to_error::deserialize(
         &mut serde_json::Deserializer::from_str(text),

@@ -1,10 +1,13 @@
-//! KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012): labels and results, and detections as AB3DMOT keeps them.
+//! KITTI tracking (Geiger, Lenz, Urtasun, CVPR 2012): labels and results, and detections as AB3DMOT
+//! keeps them.
 //!
-//! Labels, separated by blanks: frame, track, type, truncated, occluded, alpha, box in the image (4), height, width,
-//! length, x, y, z, rotation, and a score in results. Detections, separated by commas: frame, number of the type, box in
-//! the image (4), score, height, width, length, x, y, z, rotation, alpha.
+//! Labels, separated by blanks: frame, track, type, truncated, occluded, alpha, box in the image
+//! (4), height, width, length, x, y, z, rotation, and a score in results. Detections, separated by
+//! commas: frame, number of the type, box in the image (4), score, height, width, length, x, y, z,
+//! rotation, alpha.
 //!
-//! Positions are in the frame of the left camera, x right and z forward. Here x is forward and y left.
+//! Positions are in the frame of the left camera, x right and z forward. Here x is forward and y
+//! left.
 
 use ecod::model::names::Label;
 use nalgebra::Point2;

@@ -1,7 +1,7 @@
 //! MOTChallenge (Leal-Taixé et al., arXiv 1504.01942), `det.txt` and `gt.txt`.
 //!
-//! Separated by commas: frame from 1 on, track or −1, box in the image (4), score, x, y, z in metres. Truth of score 0
-//! counts nowhere. Files of the plane alone have no x and y, or −1.
+//! Separated by commas: frame from 1 on, track or −1, box in the image (4), score, x, y, z in
+//! metres. Truth of score 0 is ignored. Files with image positions only have no x and y, or −1.
 
 use ecod::model::detection::BoundingBox;
 use ecod::model::names::Label;

@@ -21,7 +21,8 @@ impl StandingCamera {
     /// The camera in a vehicle's configuration (TOML).
     ///
     /// # Errors
-    /// Naming the key, the value and what is allowed; or when there is not one camera, of known image size, that stands.
+    /// Returns an error that names the key, the value and the allowed range, or an error if there
+    /// is not exactly one camera, with a stated image size, that stands.
     pub fn load(file: &Path) -> anyhow::Result<Self> {
         let config = NodeConfig::load(Some(file), &BTreeMap::<String, String>::new())?;
         let cameras: Vec<_> = config.all_cameras().collect();

@@ -48,7 +48,8 @@ fn camera() -> StandingCamera {
     StandingCamera::load(&file).unwrap()
 }
 
-/// A box whose lower edge is that of something on the ground 20 m ahead of the camera and 2 m to its right.
+/// A box whose lower edge fits an object on the ground 20 m ahead of the camera and 2 m to its
+/// right.
 const BOX_AT_12_15: &str = "[540.0, 450.0, 20.0, 50.0]";
 
 #[test]

@@ -1,8 +1,8 @@
-//! Calibration: how often an object is there that is said to be there with a given probability.
+//! Calibration: how often an object exists that is reported with a given probability.
 //!
-//! The expected calibration error is the mean difference of both over bins of equal width, weighted by the objects in each
-//! (Naeini, Cooper, Hauskrecht, AAAI 2015). Zero is perfect; it says nothing about how well probabilities tell true objects
-//! from false ones.
+//! The expected calibration error is the mean difference of both over bins of equal width, weighted
+//! by the objects in each (Naeini, Cooper, Hauskrecht, AAAI 2015). Zero is perfect; the error does
+//! not measure how well probabilities separate true objects from false ones.
 
 use serde::Serialize;
 
@@ -12,7 +12,7 @@ use super::{SaidObject, ScoredFrame, ZERO_DISTANCE_M, percent};
 /// Bins of equal width.
 const BINS: usize = 10;
 
-/// The distance in metres within which a `confidence` says that an object is.
+/// The distance in metres within which a `confidence` places the object.
 const CONFIDENCE_DISTANCE_M: f64 = 1.5;
 
 /// Calibration of the probabilities of a map.
@@ -20,7 +20,8 @@ const CONFIDENCE_DISTANCE_M: f64 = 1.5;
 pub struct ReliabilityBins {
     /// Of `confidence`: right if a true object is within 1.5 m.
     pub confidence: Reliability,
-    /// Of `existence`, which says nothing of the place: right if a true object is within 4 m. Absent if none is stated.
+    /// Calibration of `existence`, which is independent of the exact place: right if a true object
+    /// is within 4 m. Absent if existence is not stated.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub existence: Option<Reliability>,
 }
@@ -28,7 +29,7 @@ pub struct ReliabilityBins {
 /// The reliability diagram of a probability, and its expected calibration error.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Reliability {
-    /// Expected calibration error; `None` if nothing was said.
+    /// Expected calibration error; `None` without reported objects.
     pub ece_pct: Option<f64>,
     /// Bins that are not empty, in ascending order.
     pub bins: Vec<ReliabilityBin>,
@@ -57,7 +58,8 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> ReliabilityBins {
     }
 }
 
-/// Objects and true ones of the same label are matched one to one, so that the sum of their nearness is greatest.
+/// Reported and true objects of equal label are matched one to one, so that the sum of their
+/// nearness is greatest.
 fn reliability(
     frames: &[ScoredFrame],
     limit_m: f64,
@@ -66,7 +68,7 @@ fn reliability(
     let mut sums = [(0u64, 0u64, 0.0); BINS];
     for frame in frames {
         let mut pairs = near_pairs(frame, limit_m);
-        // One that is just within the limit is still worth a match.
+        // A pair just within the limit still has some benefit.
         pairs
             .iter_mut()
             .for_each(|pair| pair.value = 2.0 - pair.value / limit_m);

@@ -1,10 +1,11 @@
-//! CLEAR MOT (Bernardin and Stiefelhagen, EURASIP J. Image and Video Processing 2008) and the detection accuracy and
-//! precision that go with it (Kasturi et al., IEEE TPAMI 2009).
+//! CLEAR MOT (Bernardin and Stiefelhagen, EURASIP J. Image and Video Processing 2008) and the
+//! detection accuracy and precision that go with it (Kasturi et al., IEEE TPAMI 2009).
 //!
-//! In every frame, pairs that matched in the frame before and are still near enough match again; the others match so
-//! that the sum of their similarities is greatest. A true object that matches another identity than the last time it
-//! matched is a switch. One that matches again after frames without a match is a fragment. Equal to `trackeval.metrics.CLEAR` at a threshold of 0.5, a frame in which nothing was said
-//! included: it ends no pair.
+//! In every frame, pairs that matched in the previous frame and are still near enough match again;
+//! the others match so that the sum of their similarities is greatest. If a true object matches
+//! another identity than in its last match, this is a switch. If it matches again after frames
+//! without a match, this is a fragment. Equal to `trackeval.metrics.CLEAR` at a threshold of 0.5,
+//! including for frames without reported objects, which do not end a pair.
 
 use hashbrown::HashMap;
 
@@ -22,7 +23,8 @@ pub(super) struct Clear {
     pub(super) distance_sum_m: f64,
 }
 
-/// Bonus of a pair that goes on, beside its similarity of at most 1: more than all others of a frame.
+/// Bonus of a continued pair, in addition to its similarity of at most 1: more than the sum of all
+/// others in a frame.
 const GOES_ON: f64 = 1000.0;
 
 pub(super) fn judge(frames: &[ScoredFrame]) -> Clear {

@@ -1,8 +1,9 @@
-//! HOTA (Luiten et al., IJCV 2021): detection and association in one figure, averaged over how near is near enough.
+//! HOTA (Luiten et al., IJCV 2021): detection and association in one figure, averaged over how near
+//! is near enough.
 //!
-//! Similarity is 1 − d/d₀, zero from d₀ on, and for unequal labels. Matches of a frame maximise the sum of similarity times
-//! how much of their lives the two identities share; thresholds from 0.05 to 0.95 are applied to the result. Equal to
-//! `trackeval.metrics.HOTA`.
+//! Similarity is 1 − d/d₀, zero from d₀ on, and for unequal labels. Matches of a frame maximise the
+//! sum of similarity times how much of their lives the two identities share; thresholds from 0.05
+//! to 0.95 are applied to the result. Equal to `trackeval.metrics.HOTA`.
 
 use hashbrown::HashMap;
 
@@ -129,7 +130,8 @@ impl AtThreshold {
             .iter()
             .map(|(ids, count)| count * lives.jaccard(*ids, *count))
             .collect();
-        // Equal sums for equal input: the order of a hash table is not that of the input.
+        // Sorted, because the order of a hash table would make equal inputs give slightly different
+        // sums.
         weighted.sort_unstable_by(f64::total_cmp);
         let assa = weighted.iter().sum::<f64>() / matches.max(1.0);
         let loca = if matches > 0.0 {

@@ -1,7 +1,9 @@
-//! IDF1 (Ristani et al., ECCV workshops 2016): how long each true object bears the one identity that suits it best.
+//! IDF1 (Ristani et al., ECCV workshops 2016): how long each true object bears the one identity
+//! that suits it best.
 //!
-//! True and given identities are matched once for the whole sequence, so that the number of frames in which matched
-//! ones are near enough is greatest. Equal to `trackeval.metrics.Identity` at a threshold of 0.5.
+//! True and given identities are matched once for the whole sequence, so that the number of frames
+//! in which matched ones are near enough is greatest. Equal to `trackeval.metrics.Identity` at a
+//! threshold of 0.5.
 
 use hashbrown::HashMap;
 
@@ -11,14 +13,14 @@ use super::{MATCH_DISTANCE_M, ScoredFrame};
 /// Counts of a whole sequence.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct IdentityScore {
-    /// Objects said that bear the identity matched to the true one.
+    /// Reported objects with the identity matched to the true one.
     true_positives: u64,
-    /// True objects and objects said, together.
+    /// Number of true and reported objects together.
     all: u64,
 }
 
 impl IdentityScore {
-    /// Twice the right ones by all; zero if there is nothing.
+    /// Twice the true positives divided by all objects; zero without objects.
     pub(super) fn f1(&self) -> f64 {
         2.0 * self.true_positives as f64 / self.all.max(1) as f64
     }

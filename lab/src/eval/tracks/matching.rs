@@ -1,10 +1,10 @@
-//! The best one-to-one matching of what was said with what is true.
+//! The best one-to-one matching of reported objects with true ones.
 
 use ecod::association::{Candidate, assign};
 
 use super::{SaidObject, ScoredFrame, TrueObject};
 
-/// A true object and one that was said, by their places in a frame or in a table of identities.
+/// A true and a reported object, by their places in a frame or in a table of identities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct MatchedPair {
     pub(super) truth: usize,
@@ -13,7 +13,7 @@ pub(super) struct MatchedPair {
     pub(super) value: f64,
 }
 
-/// Distance in metres if one may be taken for the other.
+/// Distance in metres if the two may match.
 pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) -> Option<f64> {
     let distance_m = (truth.position - said.position).norm();
     (distance_m <= limit_m && truth.label == said.label).then_some(distance_m)
@@ -39,7 +39,8 @@ pub(super) fn near_pairs(frame: &ScoredFrame, limit_m: f64) -> Vec<MatchedPair> 
     pairs
 }
 
-/// The one-to-one choice of pairs whose values have the greatest sum; pairs worth nothing are never chosen.
+/// The one-to-one selection of pairs whose values have the greatest sum; pairs without value are
+/// not selected.
 pub(super) fn best(pairs: &[MatchedPair]) -> Vec<MatchedPair> {
     assign(
         pairs

@@ -1,14 +1,16 @@
 //! Average precision by centre distance, and the greatest F1.
 //!
-//! Objects are taken in descending order of confidence; each takes the nearest true object of its label that is within
-//! the distance and not yet taken, or is a false alarm. So do nuScenes (Caesar et al., CVPR 2020, section 3.4), and
-//! OPV2V and V2V4Real with overlap in place of distance.
+//! Objects are taken in descending order of confidence; each takes the nearest true object of its
+//! label that is within the distance and not yet taken, or is a false alarm. This is also the
+//! method of nuScenes (Caesar et al., CVPR 2020, section 3.4), and OPV2V and V2V4Real with overlap
+//! in place of distance.
 //!
-//! Average precision is the area under the curve of precision over recall, with precision the greatest at that recall or a
-//! higher one, summed over all points at which recall changes: that of PASCAL VOC from 2010 on (Everingham et al., IJCV
-//! 2015) and of the cooperative benchmarks, whose figures are the ones to compare with. nuScenes leaves out what lies
-//! below 10 % of precision or recall, which is not comparable to any of them. Objects of equal confidence enter the curve
-//! together: no threshold tells them apart.
+//! Average precision is the area under the curve of precision over recall, with precision the
+//! greatest at that recall or a higher one, summed over all points at which recall changes. This is
+//! the definition of PASCAL VOC since 2010 (Everingham et al., IJCV 2015) and of the cooperative
+//! benchmarks, so the figures are comparable to theirs. nuScenes leaves out values below 10 % of
+//! precision or recall, and is not comparable. Objects of equal confidence enter the curve
+//! together, because a threshold cannot separate them.
 
 use std::collections::BTreeMap;
 
@@ -24,7 +26,8 @@ pub(super) struct BestF1 {
     pub(super) f1: f64,
 }
 
-/// The average precisions in percent of every class of the truth; a class that is only said counts nowhere.
+/// The average precisions in percent of every class of the truth; a class that is only reported is
+/// ignored.
 pub(super) fn by_class(
     frames: &[ScoredFrame],
 ) -> BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]> {
@@ -50,7 +53,7 @@ pub(super) fn by_class(
     classes
 }
 
-/// `None` if nothing was said or nothing is true.
+/// The threshold of the greatest F1; `None` without reported or without true objects.
 pub(super) fn best_f1(frames: &[ScoredFrame]) -> Option<BestF1> {
     let objects: usize = frames.iter().map(|frame| frame.truth.len()).sum();
     if objects == 0 {
@@ -68,7 +71,8 @@ pub(super) fn best_f1(frames: &[ScoredFrame]) -> Option<BestF1> {
         .reduce(|best, next| if next.f1 > best.f1 { next } else { best })
 }
 
-/// The greatest MODA in percent over all thresholds, at every distance; `None` if nothing is true.
+/// The greatest MODA in percent over all thresholds, at every distance; `None` without true
+/// objects.
 pub(super) fn best_moda_pct(frames: &[ScoredFrame]) -> [Option<f64>; AP_DISTANCES_M.len()] {
     let objects: usize = frames.iter().map(|frame| frame.truth.len()).sum();
     let moda = |point: &Point| point.recall * (2.0 - 1.0 / point.precision.max(f64::MIN_POSITIVE));

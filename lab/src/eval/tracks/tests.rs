@@ -88,8 +88,8 @@ fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
     assert_eq!(empty.at_default.false_alarms, 1);
 }
 
-/// Two objects in one frame; of three said the best and the last are right: precision 1, 1/2, 2/3 at recall 1/2, 1/2,
-/// 1.
+/// Two objects in one frame; of three reported ones the best and the last are right: precision 1,
+/// 1/2, 2/3 at recall 1/2, 1/2, 1.
 #[test]
 fn average_precision_is_that_worked_out_by_hand() {
     let frame = ScoredFrame {
@@ -182,8 +182,8 @@ fn an_object_that_is_found_again_is_a_fragment() {
     );
 }
 
-/// Five objects said: 0.95 right, 0.9 and 1.0 where 1.0 is wrong, 0.55 wrong, 0.05 right.
-/// Bins: 0.9 to 1 states 0.95 and 2 of 3 are right, 0.55 with none, 0.05 with one.
+/// Five reported objects: 0.95 right, 0.9 and 1.0 where 1.0 is wrong, 0.55 wrong, 0.05 right. Bins:
+/// 0.9 to 1 states 0.95 and 2 of 3 are right, 0.55 with zero right, 0.05 with one.
 #[test]
 fn calibration_is_that_worked_out_by_hand() {
     let frame = ScoredFrame {
@@ -227,7 +227,7 @@ fn calibration_is_that_worked_out_by_hand() {
     assert_eq!(score(&[]).calibration.confidence.ece_pct, None);
 }
 
-/// A pair that goes on keeps its match although another is nearer now.
+/// A continued pair keeps its match although another is nearer now.
 #[test]
 fn a_match_is_kept_while_it_is_near_enough() {
     let frames = [

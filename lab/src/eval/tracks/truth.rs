@@ -1,4 +1,4 @@
-//! Where everything really was, frame by frame.
+//! The true positions of all objects, frame by frame.
 
 use ecod::model::names::{Label, MAX_NAME_BYTES};
 use ecod::model::time::Timestamp;
@@ -21,8 +21,8 @@ const USUAL_PERIOD_US: u64 = 100_000;
 /// {"frames": [{"t_us": 1732154400000000, "objects": [{"id": "car-1", "label": "car", "x_m": 12.5, "y_m": -3.0}]}]}
 /// ```
 ///
-/// Frames ascend in time; an `id` is text or a whole number, once in a frame, and the same object in every frame. Where any
-/// object has none, identities are not judged.
+/// Frames ascend in time; an `id` is text or a whole number, unique in a frame, and identifies an
+/// object across frames. If any object lacks an id, identities are not evaluated.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackTruth {
     frames: Vec<TrueFrame>,
@@ -79,8 +79,8 @@ enum Id {
 }
 
 impl TrackTruth {
-    /// True if a truth file is of objects that move, not of locations: its `frames` is a list, empty or of
-    /// objects with a time or with objects.
+    /// True if a truth file describes moving objects, not locations: its `frames` is a list, empty
+    /// or of objects with a time or with objects.
     pub fn is_in(text: &str) -> bool {
         #[derive(Deserialize)]
         struct TruthKeys {
@@ -99,7 +99,7 @@ impl TrackTruth {
     /// Reads a truth file.
     ///
     /// # Errors
-    /// [`TrackTruthError`] naming the place and what is wrong with it.
+    /// Returns a [`TrackTruthError`] that names the place and the fault.
     pub fn parse(text: &str) -> Result<Self, TrackTruthError> {
         let mut source = serde_json::Deserializer::from_str(trimmed(text));
         let fields: Fields = serde_path_to_error::deserialize(&mut source)
@@ -139,7 +139,8 @@ impl TrackTruth {
     /// The truth in files of a benchmark, with an empty frame for each that a file leaves out.
     ///
     /// # Errors
-    /// Naming sequence and frame where an identity occurs twice, or when there is no object at all.
+    /// Returns an error that names sequence and frame where an identity occurs twice, or when there
+    /// is no object at all.
     pub fn from_sequences(
         sequences: &[Sequence],
         frame_rate_hz: f64,
@@ -210,7 +211,8 @@ impl TrackTruth {
             .unwrap_or(USUAL_PERIOD_US)
     }
 
-    /// The objects of a frame, where they were at a time near it: on a straight line to the frame before or after.
+    /// The objects of a frame, where they were at a time near it: on a straight line to the frame
+    /// before or after.
     pub(super) fn at(&self, number: usize, time: Timestamp) -> Vec<TrueObject> {
         let frame = &self.frames[number];
         let ahead = time.micros_from(frame.at);

@@ -46,8 +46,8 @@ fn camera(
     }
 }
 
-/// Boxes of a minute, around the pixels that change with a body alone. Bodies that others hide, even in part, or that the
-/// image's edge cuts are left out.
+/// Boxes of a minute, around the pixels that change with one body alone. Bodies that are hidden,
+/// even in part, or cut by the image's edge are left out.
 fn minute(street: &Street, camera: &StreetCamera, bodies: &[StreetBody]) -> Vec<Vec<BoundingBox>> {
     let view = StreetView {
         optics: optics(),
@@ -88,7 +88,8 @@ fn noisy(bounds: &BoundingBox, dice: &mut ChaCha8Rng) -> BoundingBox {
     }
 }
 
-/// The box of the pixels in which `alone` differs from `bare`. None if `full` hides some of them, or one is at the edge.
+/// The box of the pixels in which `alone` differs from `bare`. `None` if `full` hides some of them,
+/// or a pixel is at the edge.
 fn whole_box(alone: &Mat, bare: &Mat, full: &Mat) -> Option<BoundingBox> {
     let [alone_px, bare_px, full_px] =
         [alone, bare, full].map(|image| image.data_bytes().unwrap().chunks_exact(3));

@@ -10,7 +10,7 @@ use crate::testbed::Scene;
 /// Scene files and axes are in inches.
 pub(super) const METRES_PER_INCH: f64 = 0.0254;
 
-/// Where the world lies on the picture: east to the right, north up.
+/// The mapping of the world to the picture: east to the right, north up.
 #[derive(Debug)]
 pub(super) struct Sheet {
     /// South-western corner in metres.
@@ -22,14 +22,14 @@ pub(super) struct Sheet {
 
 impl Sheet {
     pub(super) const MARGIN_PX: f64 = 24.0;
-    /// Beside the frame: the table to the left, the legend to the right.
+    /// Next to the frame: the table to the left, the legend to the right.
     const LEFT_PX: f64 = 300.0;
     const RIGHT_PX: f64 = 260.0;
     const TOP_PX: f64 = 96.0;
     const BOTTOM_PX: f64 = 52.0;
     /// Length of the frame's longer side.
     const FRAME_PX: f64 = 600.0;
-    /// Room around what the scene holds: for placards and names.
+    /// Padding around the scene, for placards and names.
     const PADDING_M: f64 = 3.0 * METRES_PER_INCH;
     /// Least side of the frame.
     const MIN_M: f64 = 24.0 * METRES_PER_INCH;

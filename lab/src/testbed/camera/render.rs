@@ -1,4 +1,5 @@
-//! The undisturbed view: one ray per sample, four by four samples per pixel. Cards stand upright on the floor.
+//! The undisturbed view: one ray per sample, four by four samples per pixel. Cards stand upright on
+//! the floor.
 
 use std::ops::Range;
 
@@ -27,7 +28,7 @@ const CARDBOARD: Light = [92.0, 132.0, 168.0];
 const FLOOR: Light = [104.0, 110.0, 114.0];
 const WALL: Light = [150.0, 158.0, 160.0];
 
-/// View of the camera at `pose`, mounted as told, as 8-bit BGR.
+/// View of the camera at `pose` with the given mount, as 8-bit BGR.
 pub(super) fn still(
     testbed: &Testbed,
     cards: &[Card],
@@ -115,7 +116,8 @@ impl<'a> Face<'a> {
         })
     }
 
-    /// True if ink is printed at a point, in metres to the right of and above the middle of the code.
+    /// True if ink is printed at a point, in metres to the right of and above the middle of the
+    /// code.
     fn is_ink(&self, right_m: f64, up_m: f64, placard: &Placard) -> bool {
         let module = |from_edge_m: f64| {
             let at = (from_edge_m / placard.qr_width_m * self.side as f64).floor();
@@ -140,7 +142,7 @@ struct RenderView<'a> {
     bottom_m: f64,
 }
 
-/// Where a ray meets a card.
+/// Intersection of a ray with a card.
 struct Meeting<'a> {
     face: &'a Face<'a>,
     depth_m: f64,
@@ -208,7 +210,7 @@ impl<'a> RenderView<'a> {
         [range(0), range(1)]
     }
 
-    /// The light along a ray of the level frame that may meet `faces`.
+    /// The light along a ray of the level frame that may hit `faces`.
     fn light<'f>(&self, ray: &Vector3<f64>, faces: impl Iterator<Item = &'f Face<'f>>) -> Light {
         let (sin, cos) = self.pose.heading_rad.sin_cos();
         let sight = Vector2::new(cos * ray.x - sin * ray.y, sin * ray.x + cos * ray.y);

@@ -1,4 +1,5 @@
-//! Disturbances that a small camera on a running vehicle adds to a view: vibration, blur, uneven light and noise.
+//! Disturbances that a small camera on a running vehicle adds to a view: vibration, blur, uneven
+//! light and noise.
 
 use opencv::core::{BORDER_REPLICATE, Mat, Point2f, Scalar, Size};
 use opencv::imgproc::{INTER_LINEAR, gaussian_blur, get_rotation_matrix_2d, warp_affine};

@@ -10,8 +10,8 @@ fn gray(image: &Mat, x: usize, y: usize) -> f64 {
     f64::from(image.data_bytes().unwrap()[3 * (y * columns + x)])
 }
 
-/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`, and at what stands
-/// before it.
+/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`,
+/// with the objects `before` in front of it.
 fn lot(x_in: f64, yaw_deg: f64, before: &str) -> Testbed {
     let (sin, cos) = yaw_deg.to_radians().sin_cos();
     let (x, y) = (x_in - 3.5 * cos, 1.0 - 3.5 * sin);
@@ -32,7 +32,7 @@ fn still(testbed: &Testbed) -> Mat {
         .clone()
 }
 
-/// Where the values cross half of the way between both ends.
+/// The position where the values cross the middle between both ends.
 fn edge(values: &[f64]) -> f64 {
     let half = (values[0] + values[values.len() - 1]) / 2.0;
     let at = values
@@ -50,8 +50,8 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
         let camera = &testbed.camera.intrinsics;
         let card = &testbed.cards(&testbed.scenes[0])[1];
         let half_m = testbed.placard.qr_width_m / 2.0;
-        // Finder patterns are dark at the upper corners and lower left; each edge is met in the middle of the outer
-        // ring.
+        // Finder patterns are dark at the upper corners and lower left; each edge is met in the
+        // middle of the outer ring.
         for (right, up) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
             let project = |right_m: f64, up_m: f64| {
                 let (sin, cos) = card.facing_rad.sin_cos();
@@ -108,7 +108,7 @@ fn a_nearer_placard_hides_a_farther_one() {
         .is_some()
     );
     let (first, second) = (still(&two), still(&lot(16.0, 210.0, alone)));
-    // The nearer card covers both what is behind it and how that is turned.
+    // The nearer card covers the card behind it and that card's rotation.
     let near = &two.cards(scene)[2];
     let seen = Sighting::of(near, &[], &scene.cavs[0].pose, &two).unwrap();
     assert_eq!(seen.shown, 1.0);

@@ -1,9 +1,10 @@
-//! Scenes like a recorded one, with the mistakes that its detectors made.
+//! Scenes similar to a recorded one, with its detectors' errors.
 //!
-//! A generated scene has the recorded vehicles and objects, moved a little, with the objects' places exchanged. For
-//! every object in a vehicle's view, one recorded view of such an object, by any vehicle, is chosen; what was found of
-//! it, in frames drawn at random, is put where the object stands now: label, confidence, apparent size and error of
-//! bearing stay as recorded. What a vehicle found elsewhere is added as it was. Objects do not hide each other.
+//! A generated scene has the recorded vehicles and objects, moved a little, with the objects'
+//! places exchanged. For every object in a vehicle's view, one recorded view of such an object, by
+//! any vehicle, is chosen. Its detections, from frames drawn at random, are moved to the object's
+//! new place: label, confidence, apparent size and error of bearing stay as recorded. A vehicle's
+//! detections of other things are added unchanged. Objects do not hide each other.
 
 use std::ops::RangeInclusive;
 
@@ -29,11 +30,11 @@ pub struct ConfusionModel<'a> {
     recording: &'a IntersectionRecording,
     /// By object, every vehicle's view of it.
     views: Vec<Vec<View>>,
-    /// By vehicle and frame, what was found at no object.
+    /// Detections without an object, by vehicle and frame.
     clutter: Vec<Vec<Vec<Detection>>>,
 }
 
-/// One vehicle's view of one object: by frame, what was found of it.
+/// One vehicle's view of one object: its detections by frame.
 #[derive(Debug, Clone, Default)]
 struct View(Vec<Vec<Glimpse>>);
 

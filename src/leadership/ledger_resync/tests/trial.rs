@@ -2,7 +2,8 @@
 
 use super::*;
 
-/// A candidate that starts hears the claim of `gauss` first, and follows it until the leader renews its term.
+/// A candidate that starts first receives the claim of `gauss`, and follows it until the leader
+/// renews its term.
 #[test]
 fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_forgotten() {
     for has_led in [false, true] {
@@ -44,7 +45,7 @@ fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_
     }
 }
 
-/// Nor does it add to a leadership of its own that is over and known.
+/// The claimant also adds nothing to an earlier leadership of its own that has ended.
 #[test]
 fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
     let mut euclid = signing("euclid", 5, "gauss");
@@ -76,7 +77,8 @@ fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
     );
 }
 
-/// The edge box is back after some seconds: what was counted meanwhile is not lost, also by those who forgot it.
+/// The edge box returns after some seconds: the evidence counted in the meantime is kept, including
+/// on nodes that had dropped it.
 #[test]
 fn a_short_leadership_counts_at_once_where_it_was_handed_on_and_later_at_all() {
     let (mut edge, mut hopper) = (signing("edge", 8, "gauss"), signing("other", 8, "gauss"));

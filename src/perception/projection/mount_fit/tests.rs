@@ -1,4 +1,5 @@
-//! A minute of people who walk before cameras of any height and tilt, as a detector boxes them.
+//! A minute of people walking in front of cameras of any height and tilt, with boxes as from a
+//! detector.
 
 use std::f64::consts::TAU;
 
@@ -36,7 +37,8 @@ impl Dice {
         mean + sigma * (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
     }
 
-    /// A body height in metres with shoes: women and men in equal parts, and a child in twenty (NCD-RisC, Lancet 2020).
+    /// A body height in metres with shoes: women and men in equal parts, and a child in twenty
+    /// (NCD-RisC, Lancet 2020).
     fn body_height(&mut self) -> f64 {
         match self.between(0.0, 1.0) {
             share if share < 0.05 => self.normal(1.25, 0.12),
@@ -80,8 +82,9 @@ fn body(height_m: f64, at: Point2<f64>, heading_rad: f64, step_m: f64) -> Vec<Po
         .collect()
 }
 
-/// Boxes of a minute, five frames a second: people cross the place before the camera, one every three seconds. A detector's
-/// edges are off by 1.5 px and 2 % of the height. Of every tenth box the legs are hidden.
+/// Boxes of a minute, five frames a second: people cross the place before the camera, one every
+/// three seconds. A detector's edges are off by 1.5 px and 2 % of the height. Of every tenth box
+/// the legs are hidden.
 fn minute(mount: &Mount, reach_m: f64, seed: u64) -> Vec<Vec<BoundingBox>> {
     let mut dice = Dice(ChaCha8Rng::seed_from_u64(seed));
     let to_camera = mount.to_level().transpose();

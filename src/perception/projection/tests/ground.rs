@@ -1,4 +1,5 @@
-//! Boxes around objects on the ground, projected exactly, as cameras of any height and pitch see them.
+//! Boxes around objects on the ground, projected exactly, as cameras of any height and pitch see
+//! them.
 
 use std::f64::consts::PI;
 use std::time::Duration;
@@ -29,7 +30,7 @@ fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     }
 }
 
-/// Objects that a camera of this height meets.
+/// Objects that a camera of this height typically sees.
 fn kinds(height_m: f64) -> Vec<(&'static str, ObjectSize)> {
     let kind = |label, width_m, length_m, height_m, relative_sigma| {
         (
@@ -75,7 +76,8 @@ fn projection(ranging: Ranging, mount: Mount, config: &ProjectionConfig) -> Proj
     )
 }
 
-/// The box around an upright cuboid on the ground, as far as it is in the image; `None` if its foot is not.
+/// The part in the image of the box around an upright cuboid on the ground; `None` if its foot is
+/// outside.
 fn seen(
     label: &str,
     size: &ObjectSize,
@@ -157,7 +159,8 @@ impl Street {
         (-2.0 * (1.0 - u).ln()).sqrt() * (2.0 * PI * v).cos()
     }
 
-    /// An object in view of a camera with this mount, its sizes varied as `spread` times its kind's.
+    /// An object in view of a camera with this mount, its sizes varied as `spread` times its
+    /// kind's.
     fn next(&mut self, mount: &Mount, spread: f64, max_range: f64) -> (Detection, Point2<f64>) {
         let kinds = kinds(self.height_m);
         loop {
@@ -232,7 +235,7 @@ fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_heigh
     }
 }
 
-/// The share of places within their ellipse of 95 %, where every error is as large as the configuration says.
+/// The share of places within their 95 % ellipse, with every error as large as configured.
 fn coverage(
     ranging: Ranging,
     height_m: f64,
@@ -499,7 +502,8 @@ fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() 
     assert!(offset_m(&placed, at) < 1e-9);
 }
 
-/// The angle that a minute of the street tells, a box each half second, through a camera that is mounted otherwise than said.
+/// The angle found from a minute of the street, with a box each half second, for a camera that is
+/// mounted differently than stated.
 fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
     let mut street = Street::new(said.height_m.unwrap());
     let projection = projection(

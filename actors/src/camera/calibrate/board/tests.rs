@@ -1,4 +1,5 @@
-//! Photographs of boards on the ground, drawn flat and brought into the image of a camera of known mount.
+//! Photographs of boards on the ground, drawn flat and projected into the image of a camera with a
+//! given mount.
 
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;
@@ -56,7 +57,8 @@ fn code(text: &str) -> (Mat, f64) {
     )
 }
 
-/// A drawing of `side` squares of `square_m` that lies `ahead_m` before a camera, turned by `yaw_rad`, slightly out of focus.
+/// A drawing of `side` squares of `square_m` that lies `ahead_m` in front of a camera, turned by
+/// `yaw_rad`, slightly out of focus.
 fn photograph(
     drawing: &Mat,
     side: f64,

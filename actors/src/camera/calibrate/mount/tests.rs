@@ -14,7 +14,7 @@ fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     }
 }
 
-/// Points on the ground, `off_px` from where a camera sees them.
+/// Points on the ground, with pixels `off_px` from their true pixels in a camera.
 fn seen(
     places: &[(f64, f64)],
     off_px: &[(f64, f64)],

@@ -38,7 +38,7 @@ pub enum Normalization {
     Unit,
     /// -1 to 1.
     Signed,
-    /// 0 to 1, less the mean of ImageNet, over its standard deviation.
+    /// 0 to 1, minus the mean of ImageNet, divided by its standard deviation.
     Imagenet,
 }
 
@@ -73,7 +73,8 @@ pub(super) enum Layout {
     Picked(usize),
     /// `[1, boxes, 4]` and `[1, boxes, classes]`: centre and size in shares, logits.
     Queries { boxes: usize, logits: usize },
-    /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background first.
+    /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background
+    /// first.
     Priors { boxes: usize, scores: usize },
     /// `[…, boxes, 4]`, `[…, boxes]` and `[…, boxes]`: corners, score, class.
     Listed {
@@ -92,7 +93,7 @@ pub(super) struct Head {
     pub(super) is_tensorflow: bool,
 }
 
-/// Signs of a network's family beside its outputs.
+/// Evidence of a network's family in addition to its outputs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clues<'a> {
     /// The configured family.
@@ -100,12 +101,13 @@ pub(super) struct Clues<'a> {
     /// The exporter's name of the model.
     pub(super) description: &'a str,
     pub(super) input: ImageSize,
-    /// True if the network is told the size that it scales boxes to.
+    /// True if the network has an input for the size to which it scales boxes.
     pub(super) scales_boxes: bool,
 }
 
 impl Head {
-    /// The family and layout that the outputs fit; none if they fit none, or another than the configured family.
+    /// The family and layout that the outputs fit; `None` if they fit no family, or another than
+    /// the configured one.
     pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<Self> {
         let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
         let is_tensorflow = outputs
@@ -140,13 +142,14 @@ impl Head {
         }
     }
 
-    /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
+    /// True if the network has turned the cells of YOLOX into pixels itself, for which
+    /// [`Layout::Cells`] does not hold.
     pub(super) fn is_in_pixels(&self, outputs: &[NamedTensor], input: ImageSize) -> bool {
         let Layout::Cells(output) = self.layout else {
             return false;
         };
         let row = outputs[output].shape[2];
-        // Centres are within a few cells of their own; in pixels they reach the right edge.
+        // Centres are within a few cells of their own cell; in pixels they reach the right edge.
         outputs[output]
             .values
             .chunks_exact(row)
@@ -254,7 +257,7 @@ fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
     Some((Family::Ssd, Layout::Priors { boxes, scores }))
 }
 
-/// Networks with one output, beside the grids that early exports of YOLOv5 also had.
+/// Networks with one output, apart from the grids that early exports of YOLOv5 also had.
 fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let (main, others) = outputs.split_first()?;
     let [1, rows, columns] = main.shape[..] else {

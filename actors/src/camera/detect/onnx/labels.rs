@@ -4,7 +4,7 @@ use ecod::model::names::{Label, is_label};
 
 use crate::camera::detect::coco::labels as coco;
 
-/// The numbers that a network gives classes.
+/// The numbers that a network assigns to classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Classes {
     /// Scores of each box, if the network lists them.
@@ -22,10 +22,11 @@ impl Classes {
             .checked_sub(self.first + usize::from(self.has_none_last))
     }
 
-    /// The label of each number. `names` are the classes in order; without them, the classes must be COCO's.
+    /// The label of each number. `names` are the classes in order; without them, the classes must
+    /// be COCO's.
     ///
     /// # Errors
-    /// The count of classes when it differs from that of the names, or when it is not COCO's.
+    /// Returns the number of classes if it differs from the number of names, or is not COCO's.
     pub(super) fn labels(
         &self,
         names: Option<&[String]>,
@@ -56,7 +57,8 @@ fn by_id(id: usize) -> Option<Label> {
     coco::name(id).map(Label::from)
 }
 
-/// The names in a file: one on each line, without empty lines and without a background before the others.
+/// The names in a file: one on each line, without empty lines and without a background before the
+/// others.
 pub(super) fn read(text: &str) -> Vec<String> {
     let mut names: Vec<String> = text
         .lines()
@@ -73,7 +75,8 @@ pub(super) fn read(text: &str) -> Vec<String> {
     names
 }
 
-/// The names in the metadata of a model, a list or map as Python or JSON writes it: `{0: 'person', 1: "car"}`.
+/// The names in the metadata of a model, a list or map as Python or JSON writes it:
+/// `{0: 'person', 1: "car"}`.
 pub(super) fn parse(text: &str) -> Vec<String> {
     let mut names = Vec::new();
     let mut rest = text.chars().peekable();

@@ -18,7 +18,8 @@ pub(super) enum Fit {
     Stretched,
 }
 
-/// Gray level of the pixels beside the image, as in the training of all families that keep its shape.
+/// Gray level of the padding around the image, as in the training of all families that keep its
+/// shape.
 const PADDING: u8 = 114;
 
 /// An image's place in a network's input.
@@ -88,8 +89,9 @@ impl Letterbox {
         }
     }
 
-    /// The input's numbers for an image of 8-bit blue, green and red. `convert` gives those of a pixel in the order of the
-    /// network's channels, which are planes or, with `channels_last`, beside each other.
+    /// The input's numbers for an image of 8-bit blue, green and red. `convert` returns the numbers
+    /// of a pixel in the order of the network's channels, which are planes or, with
+    /// `channels_last`, adjacent.
     pub(super) fn fill(
         self,
         image: &Mat,

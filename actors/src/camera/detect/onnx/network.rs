@@ -41,7 +41,8 @@ impl Network {
     /// Loads a file. `told` is the configured size of the input.
     ///
     /// # Errors
-    /// [`OnnxError`] when the file cannot be read or run, takes something else than an image, or another size.
+    /// Returns an [`OnnxError`] if the file cannot be read or run, or takes something other than an
+    /// image, or another size.
     pub(super) fn load(path: &Path, told: Option<ImageSize>) -> Result<Self, OnnxError> {
         bounded_file::open(path).map_err(|source| OnnxError::Unreadable {
             path: path.to_owned(),
@@ -129,12 +130,12 @@ impl Network {
         self.size
     }
 
-    /// True if the three numbers of a pixel stand beside each other, false if each channel is a plane.
+    /// True if the three numbers of a pixel are adjacent, false if each channel is a plane.
     pub(super) fn has_channels_last(&self) -> bool {
         self.has_channels_last
     }
 
-    /// True if the network is told the size to which it scales its boxes.
+    /// True if the network has an input for the size to which it scales its boxes.
     pub(super) fn scales_boxes(&self) -> bool {
         self.scaled_to.is_some()
     }
@@ -144,10 +145,11 @@ impl Network {
         self.model.metadata().get(key)
     }
 
-    /// Runs the network on one image of [`Self::input_size`]. Boxes of networks that scale them are in its pixels.
+    /// Runs the network on one image of [`Self::input_size`]. Networks that scale their boxes
+    /// return them in pixels of this image.
     ///
     /// # Errors
-    /// The runtime's words.
+    /// Returns the error message of the runtime.
     pub(super) fn run(&self, pixels: Vec<f32>) -> Result<Vec<NamedTensor>, String> {
         let image: Value = if self.is_bytes {
             let bytes: Vec<u8> = pixels.into_iter().map(|value| value as u8).collect();
@@ -187,7 +189,7 @@ impl Network {
     }
 }
 
-/// The output's numbers; none of a type that no detector needs.
+/// The output's numbers; empty for a type that detectors do not use.
 fn output(name: String, value: &Value) -> NamedTensor {
     let shape = value.shape().to_vec();
     let values = match value {

@@ -1,4 +1,5 @@
-//! Models of `tests/data/onnx`; its `make.py` wrote them and decoded their outputs on its own.
+//! Tests with the models of `tests/data/onnx`. Its `make.py` wrote the models and decoded their
+//! outputs independently.
 
 use std::collections::BTreeMap;
 
@@ -24,7 +25,7 @@ fn config(model: &str) -> OnnxConfig {
     .unwrap()
 }
 
-/// The configuration with the labels where the model has none.
+/// The configuration, with labels if the model has none.
 fn labelled(model: &str) -> OnnxConfig {
     let has_names = ["yolov5", "yolov8", "rtdetr_rows"]
         .iter()
@@ -196,7 +197,7 @@ fn the_size_of_the_input_is_the_model_s() {
         told.contains("takes images of 64x64, not 96x64: remove `input_px`"),
         "{told}"
     );
-    // Its grids are for 64x64, whatever its shape says.
+    // Its grids are for 64x64, in contradiction to its shape.
     let refused = refusal(OnnxConfig {
         input_px: Some([96, 64]),
         ..config("yolov8_dynamic")

@@ -18,7 +18,7 @@ fn camera() -> Intrinsics {
     Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians())
 }
 
-/// An image drawn four times as fine as it is seen.
+/// An image drawn at four times the resolution of the camera.
 struct Scene(Mat);
 
 impl Scene {
@@ -26,7 +26,7 @@ impl Scene {
         Self(Mat::new_rows_cols_with_default(1920, 2560, CV_8UC1, Scalar::all(120.0)).unwrap())
     }
 
-    /// Draws a code with its quiet zone and says where its corners are.
+    /// Draws a code with its quiet zone and returns its corners.
     fn put(
         &mut self,
         code: &QrCode,
@@ -74,7 +74,8 @@ impl Scene {
         .unwrap();
     }
 
-    /// The picture that a camera makes of it: blur of 0.7 and noise of 5 gray levels, both standard deviations.
+    /// The picture that a camera takes of the scene: blur of 0.7 and noise of 5 gray levels, both
+    /// standard deviations.
     fn seen(&self) -> CameraFrame {
         let (mut small, mut blurred, mut image) = (Mat::default(), Mat::default(), Mat::default());
         let size = Size::new(640, 480);
@@ -152,7 +153,7 @@ fn a_placard_is_read_near_and_far_and_at_a_slant() {
         assert!((0.5..=0.99).contains(&detection.confidence));
         let found = detection.corners.unwrap();
         let module_px = nalgebra::distance(&corners[0], &corners[3]) / 21.0;
-        // The decoder guesses the lower right corner, which has no finder pattern.
+        // The decoder estimates the lower right corner, which has no finder pattern.
         for (corner, allowed_modules) in [(0, 0.5), (1, 0.5), (2, 1.5), (3, 0.5)] {
             let error = nalgebra::distance(&found[corner], &corners[corner]) / module_px;
             assert!(

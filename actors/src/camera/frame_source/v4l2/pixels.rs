@@ -1,4 +1,5 @@
-//! From a camera's pixel formats to BGR. Names, layouts and sizes of the formats are those of the kernel's
+//! Conversion from a camera's pixel formats to BGR. Names, layouts and sizes of the formats are
+//! taken from the kernel's
 //! [Video4Linux API](https://docs.kernel.org/userspace-api/media/v4l/pixfmt.html).
 
 use linuxvideo::format::{PixFormat, PixelFormat};
@@ -21,9 +22,10 @@ enum Way {
     Same,
     /// A JPEG file, perhaps without Huffman tables.
     Jpeg,
-    /// Pixels of this number of bytes, by one of OpenCV's conversions.
+    /// Pixels of this number of bytes, converted by a function of OpenCV.
     Packed(usize, i32),
-    /// Brightness in full resolution, and half as many bytes below for the colours, by one of OpenCV's conversions.
+    /// Brightness in full resolution, and half as many bytes below for the colours, converted by a
+    /// function of OpenCV.
     Planar(i32),
 }
 
@@ -50,7 +52,8 @@ const CONVERSIONS: [PixelConversion; 11] = {
     ]
 };
 
-/// Segment by which decoders know motion JPEG: without Huffman tables of its own, it has those of the JPEG standard, K.3.
+/// Segment by which decoders recognise motion JPEG: without Huffman tables of its own, the image
+/// uses the tables of the JPEG standard, K.3.
 const MOTION_JPEG: &[u8] = b"\xff\xe0\0\x07AVI1\0";
 
 impl PixelConversion {
@@ -59,7 +62,7 @@ impl PixelConversion {
         CONVERSIONS.map(Self::format)
     }
 
-    /// The preferred one of the formats that a camera offers.
+    /// The preferred format among those that a camera offers.
     pub(super) fn choose(offered: &[PixelFormat]) -> Option<Self> {
         CONVERSIONS
             .into_iter()
@@ -77,12 +80,14 @@ pub(super) struct FrameLayout {
     way: Way,
     width: i32,
     height: i32,
-    /// Bytes from a row to the next, which may be more than its pixels have; of brightness where the colours lie apart.
+    /// Bytes from a row to the next, which may be more than its pixels need; for planar formats, of
+    /// the brightness plane.
     stride: usize,
 }
 
 impl FrameLayout {
-    /// Of the format that the driver has chosen, which may have another size than was asked for.
+    /// The layout of the format that the driver has chosen, which may have another size than
+    /// requested.
     pub(super) fn new(conversion: PixelConversion, chosen: &PixFormat) -> Result<Self, String> {
         let (got, wanted) = (chosen.pixel_format(), conversion.format());
         if got != wanted {
@@ -166,7 +171,7 @@ impl FrameLayout {
 }
 
 impl Way {
-    /// Of brightness where the colours lie apart.
+    /// Bytes per pixel; for planar formats, of the brightness plane.
     fn bytes_of_pixel(self) -> usize {
         match self {
             Self::Same => 3,

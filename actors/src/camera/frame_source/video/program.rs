@@ -1,4 +1,5 @@
-//! The program `ecod-video`: opens a source by OpenCV's `VideoCapture`, and writes its frames to standard output.
+//! The program `ecod-video`: opens a source by OpenCV's `VideoCapture`, and writes its frames to
+//! standard output.
 
 use std::fs::File;
 use std::io::{self, BufRead, Write};
@@ -19,7 +20,8 @@ use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::{FrameError, FramePacer, FrameSource, SourceConfig};
 use crate::platform::clock;
 
-/// Bytes that a pipe holds at most, as far as the kernel allows: the fewer, the more often both sides wait.
+/// Maximum number of bytes in a pipe, as far as the kernel allows: with fewer bytes, both sides
+/// wait more often.
 const PIPE_BYTES: usize = 1 << 20;
 
 /// Runs until the source or standard input ends.
@@ -63,16 +65,17 @@ fn serve() -> anyhow::Result<()> {
     }
 }
 
-/// Standard output for frames alone: what libraries write there goes to standard error.
+/// Standard output, reserved for frames: output of libraries is redirected to standard error.
 fn frames_output() -> io::Result<File> {
     let output = rustix::io::fcntl_dupfd_cloexec(io::stdout(), 3)?;
     rustix::stdio::dup2_stdout(io::stderr())?;
-    // It is no pipe when somebody tries the program by hand.
+    // The output is not a pipe when a person runs the program by hand.
     let _ = rustix::pipe::fcntl_setpipe_size(&output, PIPE_BYTES);
     Ok(output.into())
 }
 
-/// Ends this process with its standard input, whatever else it does: a library may block for ever, also while a process exits.
+/// Ends this process when its standard input closes, in every state: a library may block forever,
+/// even while a process exits.
 fn end_with_input() {
     let _ = io::copy(&mut io::stdin().lock(), &mut io::sink());
     let _ = kill_process(getpid(), Signal::KILL);
@@ -252,7 +255,7 @@ impl FrameSource for Video {
     }
 }
 
-/// Names of the elements of a GStreamer pipeline; caps, references and properties are none.
+/// Names of the elements of a GStreamer pipeline; caps, references and properties are skipped.
 fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
     pipeline
         .split('!')
@@ -263,16 +266,18 @@ fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
         })
 }
 
-/// GStreamer's program that knows its elements.
+/// GStreamer's program that lists its elements.
 const INSPECTOR: &str = "gst-inspect-1.0";
 
-/// True if GStreamer says that it does not know an element; OpenCV only waits for frames then.
+/// True if GStreamer reports that an element does not exist; OpenCV would only wait for frames in
+/// this case.
 fn is_missing(element: &str) -> bool {
     let answer = Command::new(INSPECTOR).args(["--exists", element]).output();
     answer.is_ok_and(|answer| answer.status.code() == Some(1))
 }
 
-/// The operating system's error for a missing or forbidden file, since OpenCV reports none.
+/// The operating system's error for a missing or forbidden file, because OpenCV does not report
+/// one.
 fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
     let failed = |e: std::io::Error| FrameError::Open {
         origin: origin.to_owned(),

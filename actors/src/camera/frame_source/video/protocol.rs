@@ -1,4 +1,5 @@
-//! Messages between the node and the program `ecod-video`, each a line of JSON. Both are of one build.
+//! Messages between the node and the program `ecod-video`, each a line of JSON. Both are of one
+//! build.
 
 use std::io::{self, Write};
 use std::time::Duration;
@@ -7,11 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::frame_source::{FrameError, SourceConfig};
 
-/// The first and only line for the program. On a command line everybody on the machine could read the source's secrets.
+/// The first and only line for the program. On a command line, every user of the machine could read
+/// the source's secrets.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct VideoRequest {
     pub(super) source: SourceConfig,
-    /// Time after which a network camera that says nothing is given up.
+    /// Time after which a silent network camera is given up.
     pub(super) timeout: Duration,
 }
 

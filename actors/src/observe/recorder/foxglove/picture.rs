@@ -1,4 +1,5 @@
-//! A camera's pictures, the boxes of what was detected in them, and the optics by which viewers overlay both.
+//! A camera's pictures, the boxes of their detections, and the optics with which viewers overlay
+//! both.
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use ecod::model::detection::Detection;
@@ -114,7 +115,7 @@ impl CompressedImage {
 }
 
 impl CameraCalibration {
-    /// The optics of a picture; `None` if they are not known for its shape.
+    /// The optics of a picture; `None` if there are no optics for its shape.
     pub(crate) fn of(picture: &CapturedPicture) -> Option<Self> {
         let (camera, distortion) = picture.optics?;
         let (fx, fy, cx, cy) = (camera.fx, camera.fy, camera.cx, camera.cy);

@@ -112,20 +112,23 @@ const LIFETIME: Time = Time { sec: 1, nsec: 0 };
 /// `SceneEntityDeletionType` of all entities of a topic.
 const DELETE_ALL: u8 = 1;
 
-/// Diameter in metres of an object without a size, in a cell without two known locations.
+/// Diameter in metres of an object without a size, in a cell with fewer than two landmarks.
 const OBJECT_M: f64 = 0.6;
 
-/// The same in other cells: share of the usual distance from a known location to the next, and bounds in metres.
+/// Diameter in other cells: share of the usual distance between neighbouring landmarks, and bounds
+/// in metres.
 const SPACING_SHARE: f64 = 0.4;
 const OBJECT_BOUNDS_M: [f64; 2] = [0.02, 1.0];
 
-/// Diameter of a detection, length of a vehicle and of a facing, and height of a text above what it names, in diameters of an object.
+/// Diameter of a detection, length of a vehicle and of a facing, and height of a text above its
+/// object, in diameters of an object.
 const DETECTED: f64 = 0.4;
 const VEHICLE: f64 = 2.0;
 const FACING: f64 = 1.5;
 const TEXT: f64 = 1.2;
 
-/// Confidence below which no ellipse is drawn: that of a track that is nearly lost covers the map.
+/// Confidence below which no ellipse is drawn: the ellipse of a nearly lost track would cover the
+/// map.
 const LIKELY: f64 = 0.5;
 
 /// Least opacity of a text, at which it can still be read.
@@ -181,7 +184,7 @@ const TEXT_COLOR: Color = Color {
     a: 1.0,
 };
 
-/// Sizes of a cell's drawings and the facing of its known locations.
+/// Sizes of a cell's drawings and the facing of its landmarks.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct SceneStyle {
     object_m: f64,
@@ -189,7 +192,7 @@ pub(crate) struct SceneStyle {
 }
 
 impl SceneStyle {
-    /// The style of a cell with these known locations.
+    /// The style of a cell with these landmarks.
     pub(crate) fn of(landmarks: &[LandmarkConfig]) -> Self {
         let distance_m =
             |a: &LandmarkConfig, b: &LandmarkConfig| (a.x_m - b.x_m).hypot(a.y_m - b.y_m);
@@ -218,7 +221,8 @@ impl SceneStyle {
         }
     }
 
-    /// Known locations with their labels and facing, and tracked objects with the ellipses of their positions.
+    /// Landmarks with their labels and facing, and tracked objects with the ellipses of their
+    /// positions.
     pub(crate) fn map(&self, map: &GlobalMap) -> SceneUpdate {
         let landmarks = map.landmarks.iter().map(|landmark| {
             let pose = plane_pose(landmark.x_m, landmark.y_m, 0.0);
@@ -326,11 +330,12 @@ impl SceneStyle {
     }
 }
 
-/// Maximum number of known locations whose distance to the next is looked up.
+/// Maximum number of landmarks for which the distance to the next one is computed.
 const MAX_SPACINGS: usize = 256;
 
 impl SceneUpdate {
-    /// All that a topic shows; what it showed before goes, so that nothing stays where it no longer is.
+    /// Replaces all entities of a topic; earlier entities are deleted, so that outdated ones
+    /// disappear.
     pub(crate) fn new(at: Timestamp, entities: impl Iterator<Item = SceneEntity>) -> Self {
         let all = SceneDeletion {
             timestamp: at.into(),

@@ -1,16 +1,16 @@
-//! Rights of programs at their node's door, as hooks of rmqtt.
+//! Rights of programs at their node's local broker, as hooks of rmqtt.
 //!
 //! | topic | a program of the node `euclid` |
 //! |---|---|
-//! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is taken for the cell |
+//! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is forwarded to the cell |
 //! | `cell` | is the cell's new description, if `euclid` may lead |
-//! | `nodes/euclid--…` | reaches the programs at this door |
+//! | `nodes/euclid--…` | reaches the programs at this broker |
 //! | other topics of the cell | is refused |
-//! | `cpm/…` | reaches the programs at this door |
-//! | anything else | without certificates reaches the programs at this door |
+//! | `cpm/…` | reaches the programs at this broker |
+//! | anything else | without certificates reaches the programs at this broker |
 //!
-//! Without certificates, the broker of the leader and of its standby also takes reports of vehicles that have no node; so does
-//! that of a node that knows no leader yet.
+//! Without certificates, the brokers of the leader and its standby also accept reports of vehicles
+//! that have no node, and so does the broker of a node without a leader.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -35,14 +35,14 @@ use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
 
-/// Where a message is inside the broker.
+/// The place of a message inside the broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::transport::broker) enum TopicPlace {
     /// Among nodes, and vehicles without a node.
     Cell,
     /// Among programs.
     Door,
-    /// On its way from a program to the node; nobody subscribes there.
+    /// From a program to the node; subscriptions don't match this place.
     Inbound,
 }
 
@@ -72,7 +72,7 @@ impl TopicPlace {
 }
 
 impl Door {
-    /// True if a client is a program beside the node, and not a node's link.
+    /// True if a client is a local program and not a node's link.
     pub(in crate::transport::broker) fn is_program(
         &self,
         principal: &Principal,
@@ -139,7 +139,7 @@ impl Door {
             return;
         };
         let setup = &door.setup;
-        // A client that connects anew stays the same.
+        // A client that reconnects keeps its name.
         let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
         let client = named.map_or(client_id, |(name, _)| name);
         match refusal.reason {
@@ -168,7 +168,7 @@ impl Door {
         }
     }
 
-    /// The place for what a program publishes.
+    /// The place for a program's message.
     fn place_of(&self, principal: &Principal, topic: &str) -> TopicPlace {
         let Some(door) = self.0.as_deref() else {
             return TopicPlace::Cell;
@@ -189,7 +189,8 @@ impl Door {
 }
 
 impl DoorState {
-    /// True if a name is that of a vehicle without a node whose reports this broker brings to the cell.
+    /// True if a name belongs to a vehicle without a node whose reports this broker forwards to the
+    /// cell.
     fn is_nodeless(&self, principal: &Principal, name: &NodeName) -> bool {
         !(self.setup.follows)() && self.is_nodeless_name(principal, name)
     }
@@ -279,7 +280,7 @@ impl DoorState {
         Ok(())
     }
 
-    /// True if the certificate, where there are any, is the node's.
+    /// True if the certificate belongs to the node, or there are no certificates.
     fn is_own(&self, principal: &Principal) -> bool {
         principal
             .identity
@@ -303,7 +304,8 @@ impl DoorState {
         has_room
     }
 
-    /// Bounds the vehicles without a node whose statuses are retained; an empty status ends one's.
+    /// Limits the number of vehicles without a node whose statuses are retained; an empty status
+    /// removes a vehicle.
     fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
         let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else {
             return Ok(());
@@ -322,7 +324,7 @@ impl DoorState {
         Ok(())
     }
 
-    /// Takes the cell's description from a program that may act as the node.
+    /// Processes the cell's description from a program that may act as the node.
     fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), DoorRefusal> {
         let DoorSetup { node, limits, .. } = &self.setup;
         if !principal.is_of(node) {
@@ -368,7 +370,7 @@ impl DoorState {
     }
 }
 
-/// Hooks of rmqtt that keep programs and nodes apart.
+/// Hooks of rmqtt that separate programs from nodes.
 #[derive(Clone)]
 pub(in crate::transport::broker) struct DoorHooks {
     pub(in crate::transport::broker) door: Door,
@@ -376,7 +378,7 @@ pub(in crate::transport::broker) struct DoorHooks {
 }
 
 impl DoorHooks {
-    /// Registers the hooks, after those that charge messages.
+    /// Registers the hooks, after the hooks that charge messages.
     pub(in crate::transport::broker) async fn install(self, context: &ServerContext) {
         use Type::{
             ClientSubscribe, MessageDelivered, MessagePublish, SessionSubscribed,
@@ -399,8 +401,9 @@ impl DoorHooks {
         register.start().await;
     }
 
-    /// The principal of a session that is a program's. One that has just left is known by its client id, by which it had
-    /// logged in: its last will is still to come.
+    /// The principal of a session, if the session belongs to a program. A program that has just
+    /// left is identified by the client id with which it had logged in, because its last will is
+    /// still to come.
     fn program(&self, session: &Session) -> Option<Principal> {
         let principal = self.principals.principal(session.id.remote_addr);
         let principal =

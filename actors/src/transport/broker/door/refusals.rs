@@ -1,4 +1,4 @@
-//! Refusals of what programs publish, told to the program, to whoever asks, and to the operator.
+//! Refusals of programs' messages, reported to the program, to subscribers, and to the operator.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -19,14 +19,15 @@ pub(in crate::transport::broker) struct DoorRefusal {
     pub(super) text: String,
 }
 
-/// Kind of a refusal, by which it is counted.
+/// Kind of a refusal, for counting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum RefusalReason {
     Rejected(RejectReason),
     Throttled,
 }
 
-/// Maximum length of a refusal's text in bytes: it may quote what the program sent, and is shown to all.
+/// Maximum length of a refusal's text in bytes: it may quote the program's message, and all
+/// subscribers see it.
 const MAX_TEXT: usize = 500;
 
 impl DoorRefusal {
@@ -41,7 +42,7 @@ impl DoorRefusal {
         Self::new(RefusalReason::Rejected(RejectReason::NotPermitted), text)
     }
 
-    /// The answer to the program; MQTT 3.1.1 has none but an acknowledgement.
+    /// The answer to the program; MQTT 3.1.1 only has an acknowledgement.
     pub(in crate::transport::broker) fn answer(&self) -> PublishAclResult {
         let code = match self.reason {
             RefusalReason::Throttled => PublishAckReason::QuotaExceeded,
@@ -72,17 +73,17 @@ pub(super) struct Refusals {
     shown_at: Option<Timestamp>,
 }
 
-/// Clients and reasons that are shown: the latest ones.
+/// Maximum number of clients and reasons that are shown: the latest ones.
 const MAX_SHOWN: usize = 32;
 
 /// Maximum length of a client's name in characters, as it is shown.
 const MAX_CLIENT: usize = 128;
 
-/// Minimum time between two statuses for more of the same.
+/// Minimum time between two statuses for repeated refusals.
 const SHOW_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Refusals {
-    /// Notes a refusal; the status if it is to be published now.
+    /// Records a refusal; returns the status if it must be published now.
     pub(super) fn note(
         &mut self,
         node: &NodeName,
@@ -92,7 +93,8 @@ impl Refusals {
     ) -> Option<Vec<u8>> {
         let client: String = client.chars().take(MAX_CLIENT).collect();
         let key = (client.clone(), refusal.reason);
-        // Programs that draw a new name for each connection are many: what they do waits for the next status.
+        // Programs that use a new name for each connection may be many: their refusals wait for the
+        // next status.
         let has_room = self.known.len() < MAX_SHOWN;
         let is_first = !self.known.contains_key(&key);
         if is_first && !has_room {

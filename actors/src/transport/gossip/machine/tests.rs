@@ -15,7 +15,7 @@ mod certificates;
 
 const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010101";
 
-/// Machines, the datagrams between them, and what each told.
+/// Machines, the datagrams between them, and the events of each machine.
 struct Cell {
     now: Timestamp,
     nodes: BTreeMap<usize, Node>,
@@ -32,7 +32,7 @@ struct Cell {
 struct Node {
     machine: GossipMachine,
     events: Vec<MembershipEvent>,
-    /// Kinds of troubles that were told, with the names or addresses that they are about.
+    /// Kinds of reported troubles, with the names or addresses that they are about.
     troubles: BTreeSet<(String, TroubleKind)>,
     stopped: bool,
 }
@@ -42,7 +42,7 @@ impl Cell {
         Self::seeded(multicast, 3)
     }
 
-    /// A cell whose sessions differ from those of cells with another seed.
+    /// A cell whose sessions differ from the sessions of cells with another seed.
     fn seeded(multicast: bool, seed: u64) -> Self {
         Self {
             now: Timestamp(1_700_000_000_000_000),
@@ -435,7 +435,8 @@ fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up
     );
 }
 
-/// Asserts that node 9 has given up the name of node 1, which it alone was told of, and that node 1 has named it.
+/// Asserts that node 9 has given up the name of node 1, that only node 9 was informed, and that
+/// node 1 has reported it.
 fn assert_second_gave_up(cell: &Cell) {
     let (first, second) = (&cell.nodes[&1], &cell.nodes[&9]);
     assert!(
@@ -476,7 +477,7 @@ fn a_second_node_whose_only_seed_is_the_first_gives_up() {
     }
 }
 
-/// Two that met late know each other's age by when they started.
+/// Two nodes that discover each other late compare their start times.
 #[test]
 fn of_two_lone_nodes_of_a_name_that_meet_late_the_later_one_gives_up() {
     let mut cell = Cell::new(false);
@@ -602,7 +603,7 @@ fn nodes_with_another_key_are_not_seen() {
     assert!(cell.nodes[&3].machine.counters.get(FrameEvent::BadSeal) > 0);
 }
 
-/// Only the other side can tell whose key is wrong; this side has at least a seed that is silent.
+/// Only the other side can detect a wrong key; this side at least sees a silent seed.
 #[test]
 fn a_node_that_no_seed_answers_says_which_and_does_not_take_itself_for_one() {
     let mut cell = Cell::new(false);

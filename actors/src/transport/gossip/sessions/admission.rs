@@ -19,7 +19,7 @@ use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::replay_window::ReplayWindow;
 use crate::transport::gossip::session_keys::{KeyRing, KeySet};
 
-/// A node that has proven its name in a handshake, with the keys that came of it.
+/// A node that has proven its name in a handshake, with the resulting keys.
 struct Admission {
     proven: Option<Proven>,
     keys: Option<KeySet>,
@@ -27,8 +27,8 @@ struct Admission {
 }
 
 impl Sessions {
-    /// Answers a greeting with a challenge. A known living node at its known address needs no handshake, unless it asks
-    /// for one.
+    /// Answers a greeting with a challenge. A living member at its last address needs no handshake,
+    /// unless it requests one.
     pub(super) fn handle_hello(
         &mut self,
         head: &FrameHeader,
@@ -63,7 +63,7 @@ impl Sessions {
         ))
     }
 
-    /// Takes a step of the handshake.
+    /// Processes a step of the handshake.
     pub(super) fn handle_handshake(
         &mut self,
         head: &FrameHeader,
@@ -187,7 +187,8 @@ impl Sessions {
         }
     }
 
-    /// Checks that a cookie was issued to this session at this address a moment ago, and that the introduction is plausible.
+    /// Checks that a cookie was issued to this session at this address a moment ago, and that the
+    /// introduction is plausible.
     fn check_freshness(
         &self,
         session: &SessionId,
@@ -207,7 +208,8 @@ impl Sessions {
         }
     }
 
-    /// A proof of this node's certificate to a challenger; `None` while the one before may still be answered.
+    /// A proof of this node's certificate to a challenger; `None` while the one before may still be
+    /// answered.
     fn prove(
         &mut self,
         to: &SessionId,
@@ -269,7 +271,8 @@ impl Sessions {
             return Ok(FrameContent::Nothing);
         };
         let is_namesake = introduction.id.name == arrival.own.name;
-        // Drawn up before the keys are known: the answer's claim depends on the gossip and the table only.
+        // Created before the keys are available: the answer's claim depends on the gossip and the
+        // table only.
         let claim = if is_namesake {
             NameClaim::Taken
         } else {
@@ -369,8 +372,8 @@ impl Sessions {
         Err(refusal)
     }
 
-    /// Other claims to the name of a node that has just proven itself. A run that is alive elsewhere keeps its name; one at
-    /// the same address must have ended.
+    /// Other claims to the name of a node that has just proven itself. A run that is alive
+    /// elsewhere keeps its name; a run at the same address must have ended.
     fn claim(&self, head: &FrameHeader, id: &NodeId, arrival: &Arrival<'_>) -> NameClaim {
         let is_speaker = self.peers.speaker_id(&id.name) == Some(head.sender);
         let is_elsewhere = self
@@ -403,7 +406,8 @@ impl Sessions {
                 .is_some_and(|speaker| speaker.address != from)
     }
 
-    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
+    /// Stores a session that has just proven its reachability, and decides whether it is accepted
+    /// for its name.
     fn admit(
         &mut self,
         head: &FrameHeader,

@@ -16,7 +16,7 @@ use crate::transport::gossip::key::SessionId;
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::session_keys::KeyRing;
 
-/// Sessions by their number, and the one that is accepted for each name.
+/// Sessions by their number, and the accepted session of each name.
 pub(super) struct PeerTable {
     peers: HashMap<SessionId, PeerSession>,
     session_by_name: HashMap<NodeName, SessionId>,
@@ -36,16 +36,18 @@ pub(super) struct PeerSession {
     /// Counter of the frame with its last proof: no earlier one is accepted.
     pub(super) proof_counter: u64,
     pub(super) heard: Timestamp,
-    /// Time of the first frame sent to it after it was heard.
+    /// Time of the first frame sent to the node after its last frame was received.
     pub(super) unheard_since: Option<Timestamp>,
     /// Time since which another session is accepted for the name.
     pub(super) superseded: Option<Timestamp>,
 }
 
-/// Maximum sessions by one certificate: a node, its former run, and observers that share its certificate.
+/// Maximum sessions by one certificate: a node, its former run, and observers that share its
+/// certificate.
 const MAX_SESSIONS_EACH: usize = 16;
 
-/// Number of frames that a session may send at once. A leader in an election sends about 100 a second.
+/// Number of frames that a session may send at once. A leader in an election sends about 100 a
+/// second.
 const FRAMES: u32 = 1000;
 
 /// Time after which a session may send one more.
@@ -99,8 +101,9 @@ impl PeerTable {
         self.peers.values().map(|peer| peer.address).collect()
     }
 
-    /// Takes the counter of a handshake's frame in a cell without certificates. One far ahead may come, as the handshake
-    /// itself proves that it is fresh. A session that is heard at one address is not taken over from another.
+    /// Processes the counter of a handshake's frame in a cell without certificates. It may be far
+    /// ahead, because the handshake itself proves that it is fresh. A session that is active at one
+    /// address cannot be taken over from another.
     pub(super) fn take_counter(
         &mut self,
         head: &FrameHeader,
@@ -122,7 +125,8 @@ impl PeerTable {
         }
     }
 
-    /// Adds a session, if there is room: the longest idle one gives way when it is idle for long enough.
+    /// Adds a session, if there is room; the session that has been idle for longest is replaced if
+    /// it has been idle for long enough.
     pub(super) fn insert(
         &mut self,
         session: SessionId,
@@ -158,7 +162,7 @@ impl PeerTable {
         Ok(())
     }
 
-    /// Accepts a session for its name, or notes that another one is.
+    /// Accepts a session for its name, or records that another one is accepted.
     pub(super) fn settle(
         &mut self,
         session: SessionId,
@@ -184,7 +188,7 @@ impl PeerTable {
             .retain(|known, peer| peer.id.name != *name || keep(known));
     }
 
-    /// Ends the session of an earlier run of a node; false when there is none.
+    /// Ends the session of an earlier run of a node; returns false if there is none.
     pub(super) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         let Some(peer) = self.speaker_mut(name).filter(|peer| peer.id.run != run) else {
             return false;
@@ -194,7 +198,7 @@ impl PeerTable {
         true
     }
 
-    /// Ends sessions; the result are the nodes whose accepted session ended.
+    /// Ends sessions; returns the nodes whose accepted session ended.
     pub(super) fn expel(
         &mut self,
         mut is_expelled: impl FnMut(&PeerSession) -> bool,

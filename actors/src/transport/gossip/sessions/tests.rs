@@ -324,7 +324,7 @@ fn junk_is_told_apart() {
 }
 
 proptest! {
-    /// Bodies that a holder of the key got wrong.
+    /// Bodies that a holder of the key encoded incorrectly.
     #[test]
     fn sealed_junk_changes_nothing(kind in 1u8..=4, body in prop::collection::vec(any::<u8>(), 0..200)) {
         let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
@@ -339,7 +339,8 @@ proptest! {
     }
 }
 
-/// Misfits are named: a node with another key by its address, and a cell whose name is a slip away.
+/// Misconfigured nodes are reported: a node with another key by its address, and a cell whose name
+/// is a typing error away.
 #[test]
 fn another_key_and_a_misspelt_cell_are_named() {
     let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {

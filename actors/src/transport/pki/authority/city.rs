@@ -1,4 +1,4 @@
-//! The CA of a city, above those of its cells.
+//! The CA of a city, above the CAs of its cells.
 
 use std::path::Path;
 
@@ -12,11 +12,11 @@ use super::super::attestation::is_issued_by;
 use super::{Authority, AuthorityError, CA_DAYS, IssuedCertificate, ca_parameters, days, read};
 
 impl Authority {
-    /// Makes a CA for a city, as [`Authority::init`] makes one for a cell. It certifies vehicles, which hold in all cells of
-    /// the city and lead in none, and the CAs of cells.
+    /// Creates a CA for a city, as [`Authority::init`] does for a cell. It certifies vehicles,
+    /// which are valid in all cells of the city and cannot lead there, and the CAs of cells.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    /// Returns an [`AuthorityError`] if there is a CA already or the directory cannot be written.
     pub fn init_city(
         directory: &Path,
         city: &NodeName,
@@ -31,7 +31,8 @@ impl Authority {
     /// Makes a CA for a cell of this city.
     ///
     /// # Errors
-    /// [`AuthorityError`] when this is no city, there is a CA or a directory cannot be written.
+    /// Returns an [`AuthorityError`] if this is no city, there is a CA or a directory cannot be
+    /// written.
     pub fn init_cell(
         &mut self,
         directory: &Path,
@@ -61,10 +62,10 @@ impl Authority {
         })
     }
 
-    /// Revokes the CAs of a cell, such as one whose key was stolen; returns their number.
+    /// Revokes the CAs of a cell, for example if its key was stolen; returns their number.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there are none or the list cannot be written.
+    /// Returns an [`AuthorityError`] if there are no such CAs or the list cannot be written.
     pub fn revoke_cell(
         &mut self,
         cell: &NodeName,
@@ -79,7 +80,7 @@ impl Authority {
     /// True if this is the CA of a cell that a city has signed.
     ///
     /// # Errors
-    /// [`AuthorityError`] when its certificate cannot be read.
+    /// Returns an [`AuthorityError`] if its certificate cannot be read.
     pub(crate) fn is_of_city(&self) -> Result<bool, AuthorityError> {
         let unusable = |error: &dyn std::fmt::Display| AuthorityError::Crypto(error.to_string());
         let own = CertificateDer::from_pem_slice(read(&self.ca())?.as_bytes())
@@ -87,10 +88,10 @@ impl Authority {
         Ok(!is_issued_by(&own, &own))
     }
 
-    /// Checks that this is the CA of a city, or else that of a cell.
+    /// Checks that this is the CA of a city, or otherwise of a cell.
     ///
     /// # Errors
-    /// [`AuthorityError::Kind`].
+    /// Returns [`AuthorityError::Kind`].
     pub fn check_is_city(&self, is_city: bool) -> Result<(), AuthorityError> {
         if self.register.is_city == is_city {
             return Ok(());

@@ -1,8 +1,9 @@
-//! Trust of a cell that belongs to a city.
+//! Trust in a cell that belongs to a city.
 //!
-//! Certificates count that the cell's CA or the city's CA has issued itself. Those of other cells do not, although the city
-//! has signed their CAs: so a stolen key of a cell lets nobody into another. The city certifies vehicles alone: rights and broker's
-//! names in its certificates count for nothing.
+//! Certificates are accepted if the cell's CA or the city's CA has issued them directly.
+//! Certificates of other cells are refused, although the city has signed their CAs: a stolen key of
+//! a cell must not give access to another cell. The city certifies vehicles only: rights and
+//! brokers' names in its certificates are ignored.
 
 use std::path::Path;
 
@@ -17,18 +18,19 @@ use super::{CredentialsError, authorities, file_error, lists};
 
 /// CAs of a cell and of its city.
 pub(super) struct CityAuthorities {
-    /// Those of the cell that the city has signed and not revoked.
+    /// CAs of the cell that the city has signed and not revoked.
     pub(super) of_cell: Vec<CertificateDer<'static>>,
-    /// Those of the cell that the city has revoked.
+    /// CAs of the cell that the city has revoked.
     pub(super) revoked: Vec<CertificateDer<'static>>,
     /// The city's own.
     pub(super) of_city: Vec<CertificateDer<'static>>,
 }
 
-/// Reads the CAs of the cell and of its city. The city's revocation lists are put to `all`.
+/// Reads the CAs of the cell and of its city. The city's revocation lists are added to `all`.
 ///
 /// # Errors
-/// [`CredentialsError`] naming the file, in particular for a CA of the cell that the city has not signed.
+/// Returns a [`CredentialsError`] that names the file, in particular for a CA of the cell that the
+/// city has not signed.
 pub(super) fn authorities_of(
     cell: &Path,
     city: &CityTlsConfig,

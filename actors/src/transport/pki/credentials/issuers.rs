@@ -1,7 +1,9 @@
 //! The CAs that certify nodes of a cell.
 //!
-//! Certificates count that one of them has issued itself: what else a peer sends along leads nowhere. Each CA is verified with its own
-//! key and its own revocation list, so that CAs of equal names are not confused, as a cell's former one and the present one.
+//! Certificates are accepted if one of these CAs has issued them directly; intermediate
+//! certificates sent by a peer are ignored. Each CA is verified with its own key and its own
+//! revocation list, so that CAs with equal names, such as a cell's former and current CA, are not
+//! confused.
 
 use std::sync::Arc;
 
@@ -19,7 +21,7 @@ use rustls::{
 use super::super::attestation::{is_issued_by, is_list_of};
 use super::{CredentialsError, crypto};
 
-/// The CAs of a cell, and those of the city above it. Verifies clients' certificates.
+/// The CAs of a cell, and the CAs of the city above it. Verifies clients' certificates.
 #[derive(Debug)]
 pub(in super::super) struct Issuers {
     of_cell: Vec<Issuer>,
@@ -28,7 +30,7 @@ pub(in super::super) struct Issuers {
     names: Vec<DistinguishedName>,
 }
 
-/// A CA and what verifies its certificates.
+/// A CA and the verifiers of its certificates.
 #[derive(Debug)]
 struct Issuer {
     certificate: CertificateDer<'static>,
@@ -48,7 +50,7 @@ impl Issuers {
     /// CAs with their lists. While there is any list, certificates of a CA without one are refused.
     ///
     /// # Errors
-    /// [`CredentialsError::Unusable`] for a CA or list that cannot be used.
+    /// Returns [`CredentialsError::Unusable`] for a CA or list that cannot be used.
     pub(super) fn new(
         of_cell: Vec<CertificateDer<'static>>,
         of_city: Option<Vec<CertificateDer<'static>>>,
@@ -70,7 +72,8 @@ impl Issuers {
         })
     }
 
-    /// True if a certificate may give rights: a city certifies vehicles alone, whatever its certificates say.
+    /// True if a certificate may give rights: a city's certificates never do, because a city
+    /// certifies only vehicles.
     pub(super) fn give_rights(&self, certificate: &[u8]) -> bool {
         self.of_city.is_none()
             || self
@@ -101,7 +104,7 @@ impl Issuer {
             .filter(|list| is_list_of(&certificate, list))
             .cloned()
             .collect();
-        // Those of others leave its certificates without a known status.
+        // With other CAs' lists, the status of this CA's certificates would be unknown.
         let lists = if own.is_empty() { lists.to_vec() } else { own };
         let mut clients = WebPkiClientVerifier::builder_with_provider(Arc::clone(&roots), crypto());
         let mut servers = WebPkiServerVerifier::builder_with_provider(roots, crypto());
@@ -121,7 +124,7 @@ impl Issuer {
     }
 }
 
-/// Verifies by each issuer in turn. The error is that of the issuer whose certificate it is.
+/// Verifies by each issuer in turn. Returns the error of the issuer that issued the certificate.
 fn verify_by<'a, T>(
     issuers: impl Iterator<Item = &'a Issuer>,
     verify: impl Fn(&Issuer) -> Result<T, Error>,
@@ -199,7 +202,7 @@ impl ServingNodes {
         })
     }
 
-    /// Verifier of doors, which vehicles of the city have, too.
+    /// Verifier of local brokers, which vehicles of the city have, too.
     pub(super) fn doors(issuers: &Arc<Issuers>) -> Arc<dyn ServerCertVerifier> {
         Arc::new(Self {
             issuers: Arc::clone(issuers),

@@ -1,8 +1,9 @@
-//! Junk, and frames that somebody recorded and sends again.
+//! Junk, and frames that an attacker recorded and sends again.
 
 use super::*;
 
-/// Everything that was ever sent, again: to whom it was meant, to everybody else, and to nodes that have restarted.
+/// All frames that were ever sent, again: to their addressee, to all other nodes, and to nodes that
+/// have restarted.
 #[test]
 fn recorded_frames_change_nothing() {
     let mut cell = Cell::of(4);
@@ -46,7 +47,8 @@ fn recorded_frames_change_nothing() {
     }
 }
 
-/// A recorded cell, replayed to a lone node of the same name and key that has restarted: nobody appears.
+/// A recorded cell, replayed to a lone restarted node with the same name and key: no member
+/// appears.
 #[test]
 fn recorded_frames_conjure_up_nobody() {
     let mut old = Cell::of(4);
@@ -133,7 +135,7 @@ proptest! {
         node.machine.tick(now);
         prop_assert_eq!(node.machine.members(), members);
         while let Some(output) = node.machine.poll() {
-            // A greeting that is not sealed rightly may be one under another key.
+            // A greeting with a wrong seal may come from a node with another key.
             let is_notice = matches!(output, GossipOutput::Tell(MembershipEvent::Troubled { .. }));
             prop_assert!(is_notice || !matches!(output, GossipOutput::Tell(_)), "{:?}", output);
         }

@@ -37,7 +37,7 @@ impl CertifiedCell {
         &mut self.cell.nodes.get_mut(&node).unwrap().machine
     }
 
-    /// Hands a node changed files.
+    /// Gives a node changed files.
     fn set_identity(&mut self, node: usize, identity: Identity) {
         let now = self.cell.now;
         self.machine(node).set_identity(identity, now);
@@ -163,7 +163,7 @@ fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
     assert_eq!(certified.cell.events(), 0);
 }
 
-/// A machine that starts in 1970 takes no certificate for valid, and takes part once its clock is set.
+/// A machine that starts in 1970 rejects all certificates, and joins once its clock is set.
 #[test]
 fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
     let mut certified = CertifiedCell::of(2);
@@ -210,7 +210,7 @@ fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
     }
 }
 
-/// A member lies about another: a later life, another address, another role.
+/// A member makes false statements about another: a later life, another address, another role.
 #[test]
 fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
     let mut certified = CertifiedCell::of(3);
@@ -244,7 +244,7 @@ fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
     );
 }
 
-/// A member says again and again that another is down, which speaks all the while.
+/// A member reports repeatedly that another node is down, while that node keeps sending.
 #[test]
 fn a_node_that_is_heard_is_not_down_on_the_word_of_others() {
     let mut certified = CertifiedCell::of(3);

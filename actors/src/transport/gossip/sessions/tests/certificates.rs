@@ -1,4 +1,5 @@
-//! Handshakes that prove certificates, and attacks on them by a holder of the cell's key or of another certificate.
+//! Handshakes that prove certificates, and attacks on them by a holder of the cell's key or of
+//! another certificate.
 
 use rustls::pki_types::UnixTime;
 
@@ -42,7 +43,7 @@ fn proof(a: &mut End, b: &mut End) -> Vec<u8> {
     answer(a.open(&challenge, b.address, NOW + SLOW))
 }
 
-/// Somebody with the cell's key opens a handshake's frame and seals it again.
+/// An attacker with the cell's key opens a handshake's frame and seals it again.
 fn reseal(
     receiver: &SessionId,
     frame: &[u8],
@@ -105,7 +106,7 @@ fn every_frame_of_the_longest_names_fits_a_datagram() {
     assert!(sizes.iter().all(|size| *size <= 1248), "{sizes:?}");
 }
 
-/// The defect of before: a holder of the cell's key muted a link by one frame with the last counter.
+/// The former defect: a holder of the cell's key muted a link by one frame with the last counter.
 #[test]
 fn the_cells_key_alone_reads_and_forges_nothing() {
     let (_authority, mut a, mut b) = two();
@@ -265,7 +266,7 @@ fn swapped_ephemerals_and_certificates_are_noticed() {
         a.open(&swapped, b.address, NOW + SLOW),
         Err(FrameEvent::Untrusted)
     );
-    // Eve accepts as herself in the session of b, whose words would then be hers.
+    // Eve accepts as herself in the session of b, so that b's messages would be attributed to her.
     let posing = reseal(&to_a, &accept, |head, body| {
         let (message, rest) = decode_first::<Handshake>(body).unwrap();
         let theirs: Attestation = decode(rest).unwrap();
@@ -300,7 +301,7 @@ fn swapped_ephemerals_and_certificates_are_noticed() {
     assert_both_heard(&mut a, &mut b);
 }
 
-/// The holder of one certificate makes up observers without end.
+/// The holder of one certificate invents any number of observers.
 #[test]
 fn one_certificate_does_not_fill_the_table() {
     let mut authority = TrialAuthority::new();
@@ -319,7 +320,7 @@ fn one_certificate_does_not_fill_the_table() {
     introduce(&mut node(&mut authority, "a", 100), &mut b);
 }
 
-/// Everything that a node sent comes back to it.
+/// All frames that a node sent are returned to it.
 #[test]
 fn reflected_frames_are_refused() {
     let (_authority, mut a, mut b) = two();
@@ -333,7 +334,8 @@ fn reflected_frames_are_refused() {
     assert_eq!(a.open(&frame, b.address, NOW), Err(FrameEvent::Replayed));
 }
 
-/// Both sides start a handshake at once. Whatever comes first, and if one accept is lost, both hear each other.
+/// Both sides start a handshake at once. In any order, and if one accept is lost, both can open
+/// each other's frames.
 #[test]
 fn two_handshakes_at_once_leave_both_understood() {
     for (a_hears, b_hears) in [(true, true), (true, false), (false, true)] {
@@ -354,7 +356,8 @@ fn two_handshakes_at_once_leave_both_understood() {
     }
 }
 
-/// The cell's key forges challenges without end, for nearly a second, from made-up addresses and from that of a node.
+/// A holder of the cell's key forges challenges for nearly a second, from invented addresses and
+/// from a node's address.
 fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
     let (key, receiver) = (cell_key(), to.sessions.own);
     for number in 1..=2000_u64 {
@@ -382,7 +385,7 @@ fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
     }
 }
 
-/// True if a node that has restarted is met again.
+/// True if a node that has restarted is admitted again.
 fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
     let challenge = answer(restarted.open(&a.hello(), a.address, at));
     let Ok(FrameContent::Answer(proof)) = a.open(&challenge, restarted.address, at) else {

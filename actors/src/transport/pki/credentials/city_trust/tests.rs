@@ -123,7 +123,7 @@ fn a_stolen_key_of_a_cell_lets_nobody_into_another_even_with_its_chain() {
         cell.issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
     }
     let files = city.files(&city.cells[0], &edge, 0);
-    // Without lists, nothing but the chain can be wrong.
+    // Without lists, only the chain can be wrong.
     let open_city = files.city.clone().map(|city| CityTlsConfig {
         revocation_list: None,
         ..city
@@ -166,7 +166,8 @@ fn refuses_the_other_cell(city: &City, of_north: &LoadedCredentials, edge: &Node
     );
 }
 
-/// Replaces the certificate of a city's vehicle by one of the city's CA that claims all that a leader's has.
+/// Replaces the certificate of a city's vehicle by one of the city's CA that claims all properties
+/// of a leader's certificate.
 fn overstate(city: &City, node: &NodeName) {
     let directory = city.city.ca();
     let (certificate, key) = city.city.files_of(node);
