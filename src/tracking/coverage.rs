@@ -148,8 +148,14 @@ impl Coverage {
     }
 
     fn bin(distance_m: f64) -> usize {
-        let doublings = (distance_m / Self::FIRST_BIN_M).max(1.0).log2().ceil();
-        (doublings as usize).min(Self::BINS - 1)
+        let mut end_m = Self::FIRST_BIN_M;
+        for bin in 0..Self::BINS - 1 {
+            if distance_m <= end_m {
+                return bin;
+            }
+            end_m *= 2.0;
+        }
+        Self::BINS - 1
     }
 }
 

@@ -144,23 +144,22 @@ impl DetectionRates {
     }
 }
 
-/// Rates at one look: those of an object there, and those of clutter.
+/// Probabilities of a detection at one look: if an object is there, and if the track is clutter.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LookRates {
-    pub(super) object: DetectionRates,
-    pub(super) clutter: DetectionRates,
+    pub(super) object: f64,
+    pub(super) clutter: f64,
     /// True if the vehicle states its field of view: otherwise it may not have looked there.
     pub(super) is_view_stated: bool,
 }
 
 impl LookRates {
     /// Log-likelihood ratio of a result, if an object is there and if the track is clutter.
-    pub(super) fn nats(&self, state: LookState, is_hit: bool) -> f64 {
-        let [object, clutter] = [self.object.rate(state), self.clutter.rate(state)];
+    pub(super) fn nats(&self, is_hit: bool) -> f64 {
         if is_hit {
-            (object / clutter).ln().max(0.0)
+            (self.object / self.clutter).ln().max(0.0)
         } else {
-            ((1.0 - object) / (1.0 - clutter)).ln().min(0.0)
+            ((1.0 - self.object) / (1.0 - self.clutter)).ln().min(0.0)
         }
     }
 }
@@ -183,6 +182,9 @@ impl Existence {
 
     /// Predicts to `at`: the object may have left at this rate per second, and at a greater one if nobody detects it.
     pub(super) fn predict(&mut self, at: Timestamp, leaving_hz: f64, is_detected: bool) {
+        if at <= self.at {
+            return;
+        }
         self.log_odds = self.log_odds_at(at, leaving_hz, is_detected);
         self.at = self.at.max(at);
     }
@@ -286,7 +288,7 @@ impl SensorHistory {
 
     /// Records a look at the object in view without a detection.
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
-        self.look(at, rates.nats(self.state, false));
+        self.look(at, rates.nats(false));
         self.state = self.state.after(false);
         self.is_view_stated = rates.is_view_stated;
     }

@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
-use super::existence::{DetectionRates, LookRates};
+use super::existence::{DetectionRates, LookRates, LookState};
 use super::handles::SensorId;
 use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
@@ -218,23 +218,30 @@ impl SensorModel {
         }
     }
 
-    /// Rates at a look at a reported position; `None` outside the field of view.
-    pub(super) fn look_rates(&self, reported: &Vector2<f64>) -> Option<LookRates> {
-        let object = *self.coverage.rates_at(reported)?;
-        Some(LookRates {
-            object,
-            clutter: self.clutter,
-            is_view_stated: self.coverage.is_stated(),
-        })
+    /// Rates at a look at a reported position in this state; `None` outside the field of view.
+    pub(super) fn look_rates(
+        &self,
+        reported: &Vector2<f64>,
+        state: LookState,
+    ) -> Option<LookRates> {
+        let object = self.coverage.rates_at(reported)?;
+        Some(self.rates(object, state))
     }
 
-    /// Rates at a detection, which may be outside the field of view.
-    pub(super) fn hit_rates(&self, reported: &Vector2<f64>) -> LookRates {
-        self.look_rates(reported).unwrap_or(LookRates {
-            object: DetectionRates::object(),
-            clutter: self.clutter,
+    /// Rates at a detection in this state, which may be outside the field of view.
+    pub(super) fn hit_rates(&self, reported: &Vector2<f64>, state: LookState) -> LookRates {
+        match self.coverage.rates_at(reported) {
+            Some(object) => self.rates(object, state),
+            None => self.rates(&DetectionRates::object(), state),
+        }
+    }
+
+    fn rates(&self, object: &DetectionRates, state: LookState) -> LookRates {
+        LookRates {
+            object: object.rate(state),
+            clutter: self.clutter.rate(state),
             is_view_stated: self.coverage.is_stated(),
-        })
+        }
     }
 
     /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.

@@ -194,15 +194,16 @@ impl InstantUpdate<'_> {
                     continue;
                 };
                 let place = scan.detections[detection].reported;
+                let state = history
+                    .get(scan.sensor)
+                    .map_or(LookState::First, |history| history.state);
                 looks.push(Look {
                     track,
                     scan: number,
                     detection: Some(detection),
                     place,
-                    rates: sensor.hit_rates(&place),
-                    state: history
-                        .get(scan.sensor)
-                        .map_or(LookState::First, |history| history.state),
+                    rates: sensor.hit_rates(&place, state),
+                    state,
                     is_in_view: sensor.coverage.rates_at(&place).is_some(),
                     is_hidden: false,
                 });
@@ -237,12 +238,13 @@ impl InstantUpdate<'_> {
                 return;
             }
             let place = indexed.position + indexed.velocity * since_indexed_s;
-            let Some(rates) = sensor.look_rates(&place) else {
+            let track = &self.tracks[indexed.track];
+            let history = track.history.get(scan.sensor);
+            let state = history.map_or(LookState::First, |history| history.state);
+            let Some(rates) = sensor.look_rates(&place, state) else {
                 return;
             };
-            let track = &self.tracks[indexed.track];
             let has_jumped = (track.state.position_at(self.at) - place).norm() > self.config.gate_m;
-            let history = track.history.get(scan.sensor);
             let is_stale = history.is_some_and(|history| history.last_look >= self.at);
             let has_room = history.is_some() || track.history.has_room(scan.sensor, self.at);
             if track.vehicle == Some(scan.sensor) || has_jumped || is_stale || !has_room {
@@ -254,7 +256,7 @@ impl InstantUpdate<'_> {
                 detection: None,
                 place,
                 rates,
-                state: history.map_or(LookState::First, |history| history.state),
+                state,
                 is_in_view: true,
                 is_hidden: scan.occlusion.hides(&place),
             });
@@ -359,7 +361,7 @@ impl InstantUpdate<'_> {
             let scan = &scans[look.scan];
             let track = &mut self.tracks[look.track];
             track.predict_existence(at, leaving_hz);
-            let nats = look.rates.nats(look.state, look.detection.is_some());
+            let nats = look.rates.nats(look.detection.is_some());
             if look.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
             }
@@ -387,6 +389,12 @@ impl InstantUpdate<'_> {
             };
             due.extend(statement.map(|statement| (number, statement)));
         }
+        let mut seen: Vec<TrackIndex> = looks.iter().map(|look| look.track).collect();
+        seen.sort_unstable();
+        seen.dedup();
+        for track in seen {
+            self.tracks[track].note_detected(at);
+        }
         for look in looks {
             self.learn(look, &scans[look.scan]);
         }
@@ -399,7 +407,6 @@ impl InstantUpdate<'_> {
     /// Learns rates and calibration from a look, by the existence after all looks of the instant.
     fn learn(&mut self, look: &Look, scan: &Scan<'_>) {
         let track = &mut self.tracks[look.track];
-        track.note_detected(self.at);
         if track.vehicle.is_some() {
             return;
         }
@@ -409,13 +416,13 @@ impl InstantUpdate<'_> {
             self.population.settle(true);
         }
         let is_hit = look.detection.is_some();
-        let is_seen_by_others = track.is_seen_by_others(scan.sensor, self.at);
-        let is_evident = is_seen_by_others || look.state.is_hit();
-        let is_confirmed = track.is_confirmed();
+        let is_evident = track.is_confirmed()
+            && look.is_in_view
+            && (look.state.is_hit() || track.is_seen_by_others(scan.sensor, self.at));
         let Some(sensor) = self.sensors.get_mut(scan.sensor) else {
             return;
         };
-        if look.is_in_view && is_confirmed && is_evident {
+        if is_evident {
             sensor
                 .coverage
                 .learn(&look.place, look.state, is_hit, exists);
@@ -465,7 +472,7 @@ impl InstantUpdate<'_> {
             return;
         };
         let (reach_m, near_m) = (sensor.coverage.range_m(), 2.0 * self.config.gate_m);
-        let rates_at = |place: &Vector2<f64>| sensor.look_rates(place);
+        let is_in_view = |place: &Vector2<f64>| sensor.coverage.rates_at(place).is_some();
         // Objects that nobody can see take no place from others.
         let is_looked_at = |place: &Vector2<f64>| {
             let is_within = (place - centre).norm() <= reach_m;
@@ -473,9 +480,7 @@ impl InstantUpdate<'_> {
                 .detections
                 .iter()
                 .map(|detection| detection.measurement.position);
-            is_within
-                && (rates_at(place).is_some()
-                    || places.any(|other| (other - place).norm() <= near_m))
+            is_within && (is_in_view(place) || places.any(|other| (other - place).norm() <= near_m))
         };
         for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
             let position = foreign.state.position_at(at);
@@ -492,11 +497,11 @@ impl InstantUpdate<'_> {
                 .map(|detection| detection.confidence_nats)
                 .max_by(f64::total_cmp);
             if let Some(confidence) = confidence {
-                let nats = sensor.hit_rates(&position).nats(state, true);
+                let nats = sensor.hit_rates(&position, state).nats(true);
                 if let Some(history) = foreign.history.for_hit(id, at) {
                     history.hit(at, position, nats, confidence);
                 }
-            } else if let Some(rates) = rates_at(&position)
+            } else if let Some(rates) = sensor.look_rates(&position, state)
                 && let Some(history) = foreign.history.for_look(id, at)
             {
                 history.miss(at, &rates);
@@ -563,8 +568,8 @@ impl InstantUpdate<'_> {
             let nats = if number == 0 {
                 0.0
             } else {
-                let rates = sensor.hit_rates(&detection.reported);
-                rates.nats(LookState::First, true)
+                let rates = sensor.hit_rates(&detection.reported, LookState::First);
+                rates.nats(true)
             };
             log_odds += scan.trust * nats;
             describe(&mut track, detection, sensor, at);
@@ -580,9 +585,9 @@ impl InstantUpdate<'_> {
             let Some(sensor) = self.sensors.get(scan.sensor) else {
                 continue;
             };
-            let rates = sensor.look_rates(&position);
+            let rates = sensor.look_rates(&position, LookState::First);
             if let Some(rates) = rates {
-                let nats = rates.nats(LookState::First, false);
+                let nats = rates.nats(false);
                 log_odds += scan.trust * nats;
                 if let Some(history) = track.history.for_look(scan.sensor, at) {
                     history.miss(at, &rates);
