@@ -47,8 +47,8 @@ pub const LOOKAHEAD: usize = 64;
 const MAX_LEARNT_LANDMARKS: usize = 4096;
 
 /// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file
-/// is no attacker: labels are limited by [`MAX_LABELS`] only, the objects of a report by the length
-/// of its line.
+/// is not an attacker: labels are limited by [`MAX_LABELS`] only, the objects of a report by the
+/// length of its line.
 const MAX_VOTE_LANDMARKS: usize = 1_000_000;
 
 /// Maximum number of rejected lines of one reason whose flaws are kept.

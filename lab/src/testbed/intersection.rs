@@ -242,8 +242,8 @@ pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<Strin
     serde_json::to_string(&line)
 }
 
-/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both,
-/// the maps are judged.
+/// The maps or verdicts of these algorithms and their accuracy, each frame separately; with both
+/// algorithms, the maps are evaluated.
 fn fuse(
     recording: &IntersectionRecording,
     reports: &[ObjectReport],

@@ -80,7 +80,7 @@ pub struct Door(Option<Arc<DoorState>>);
 
 struct DoorState {
     setup: DoorSetup,
-    /// To the broker's present run.
+    /// Queue to the broker's current run.
     queue: Mutex<Option<mpsc::Sender<Publication>>>,
     /// Last message of each topic that is retained, for the broker's next run.
     retained: Mutex<BTreeMap<String, Bytes>>,
@@ -320,7 +320,8 @@ impl DoorState {
         })
     }
 
-    /// Hands a message to the broker's present run, if there is one; false if it has no room.
+    /// Passes a message to the broker's current run, if there is one; returns false if it has no
+    /// room.
     fn send(&self, publication: Publication) -> bool {
         let queue = lock(&self.queue);
         let has_room = queue
