@@ -21,7 +21,7 @@ use super::config::TracksConfig;
 use super::existence::LookState;
 use super::handles::TrackIndex;
 use super::kinematics::inverse;
-use super::scan::{Detection, Scan};
+use super::scan::{Scan, ScannedDetection};
 use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::track::{MIN_LABEL_SIMILARITY, Track};
@@ -235,7 +235,7 @@ impl<'a> Assignment<'a> {
     }
 
     /// Benefit of pairing a detection with a new track of any velocity; `None` if they cannot be the same object.
-    fn benefit_if_fast(&self, track: &Track, detection: &Detection<'_>) -> Option<f64> {
+    fn benefit_if_fast(&self, track: &Track, detection: &ScannedDetection<'_>) -> Option<f64> {
         let passed = self.at.since(track.last_seen);
         let offset = detection.measurement.position - track.state.position_at(self.at);
         let max_mps = detection.class.max_speed_mps;
@@ -303,7 +303,7 @@ impl<'a> Assignment<'a> {
     fn benefit(
         &self,
         scan: &Scan<'_>,
-        detection: &Detection<'_>,
+        detection: &ScannedDetection<'_>,
         hypothesis: &Hypothesis,
     ) -> Option<f64> {
         let (position, covariance) = hypothesis.information.mean()?;
@@ -340,7 +340,7 @@ impl<'a> Assignment<'a> {
     }
 
     /// A new hypothesis at a detection.
-    fn open(&mut self, detection: &Detection<'_>) -> usize {
+    fn open(&mut self, detection: &ScannedDetection<'_>) -> usize {
         let square = self.square(&detection.measurement.position);
         let number = self.hypotheses.len();
         self.hypotheses.push(Hypothesis {

@@ -54,8 +54,9 @@ pub(super) fn merge(
                 .map_or(UNKNOWN_RATE, |rates| rates.rate(LookState::Hit(1)))
         };
         let mut twins = std::mem::take(&mut tracks[older].twins);
-        twins.weigh(&tracks[older], &tracks[later], now, rate);
-        let is_twin = twins.is_twin(tracks[later].id);
+        let other = &tracks[later];
+        twins.weigh(&tracks[older].history, &other.history, other.id, now, rate);
+        let is_twin = twins.is_twin(other.id);
         tracks[older].twins = twins;
         if is_twin && !merged.contains(&older) && merged.insert(later) {
             tracks.merge(older, later);

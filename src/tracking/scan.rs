@@ -16,7 +16,7 @@ const MIN_TRUST: f64 = 0.05;
 
 /// A detection of a report, corrected by the estimated pose bias.
 #[derive(Debug)]
-pub(super) struct Detection<'a> {
+pub(super) struct ScannedDetection<'a> {
     /// Index into the objects of the report.
     pub(super) index: usize,
     pub(super) object: &'a PerceivedObject,
@@ -41,7 +41,7 @@ pub(super) struct Scan<'a> {
     pub(super) delay_s: f64,
     /// True if the vehicle has jumped to another place, so that its earlier samples are void.
     pub(super) has_jumped: bool,
-    pub(super) detections: Vec<Detection<'a>>,
+    pub(super) detections: Vec<ScannedDetection<'a>>,
     /// What the detections hide. It excuses misses; existences learn from the rates alone.
     pub(super) occlusion: OcclusionMap,
 }
@@ -69,7 +69,7 @@ impl<'a> Scan<'a> {
             }
             let class = ObjectClass::of(&object.label, config);
             let covariance = sensor.noise.covariance(object, own.as_ref(), config);
-            detections.push(Detection {
+            detections.push(ScannedDetection {
                 index,
                 object,
                 class,

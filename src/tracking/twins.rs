@@ -9,8 +9,8 @@ use std::time::Duration;
 use smallvec::SmallVec;
 use uuid::Uuid;
 
+use super::detection_history::DetectionHistory;
 use super::existence::SensorHistory;
-use super::track::Track;
 use crate::model::time::Timestamp;
 
 /// Log-odds from which two tracks are one object. Below their negative, further looks change nothing.
@@ -39,18 +39,19 @@ impl Twins {
     /// Weighs the looks at both tracks since the last time. `rate` is a vehicle's probability of a detection of either.
     pub(super) fn weigh(
         &mut self,
-        own: &Track,
-        other: &Track,
+        own: &DetectionHistory,
+        other: &DetectionHistory,
+        other_id: Uuid,
         now: Timestamp,
         rate: impl Fn(&SensorHistory) -> f64,
     ) {
         self.0.retain(|twin| now.since(twin.at) <= REMEMBERED);
-        let known = self.0.iter().position(|twin| twin.id == other.id);
+        let known = self.0.iter().position(|twin| twin.id == other_id);
         let since = known.map_or(Timestamp::default(), |known| self.0[known].at);
         let (mut nats, mut is_own_alone, mut is_other_alone) = (0.0, false, false);
         let mut at = since;
-        for look in own.history.iter() {
-            let Some(theirs) = other.history.get(look.sensor) else {
+        for look in own.iter() {
+            let Some(theirs) = other.get(look.sensor) else {
                 continue;
             };
             let is_new = look.last_look > since && look.last_look == theirs.last_look;
@@ -79,7 +80,7 @@ impl Twins {
                 twin.at = at;
             }
             None if nats != 0.0 => self.0.push(Twin {
-                id: other.id,
+                id: other_id,
                 nats,
                 at,
             }),

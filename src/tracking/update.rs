@@ -16,7 +16,7 @@ use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
 use super::population::Population;
 use super::registration::{RegistrationFrame, RegistrationSample};
-use super::scan::{Detection, Scan};
+use super::scan::{Scan, ScannedDetection};
 use super::sensors::{Residual, SensorModel, Sensors};
 use super::store::TrackStore;
 use super::track::Track;
@@ -602,7 +602,12 @@ impl InstantUpdate<'_> {
 }
 
 /// Updates velocity and attributes of a track by one detection.
-fn describe(track: &mut Track, detection: &Detection<'_>, sensor: &SensorModel, at: Timestamp) {
+fn describe(
+    track: &mut Track,
+    detection: &ScannedDetection<'_>,
+    sensor: &SensorModel,
+    at: Timestamp,
+) {
     let object = detection.object;
     if let Some([x, y]) = object.velocity_mps {
         let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
