@@ -95,7 +95,7 @@ trouble_kinds! {
     NotFused = "not_fused", SHORT, "set `fusion.algorithms` to what the cell is for, or report for the other algorithm";
     /// Messages beyond the rights of their sender, or without a signature that is due.
     NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
-    /// More messages than are taken.
+    /// More messages than are accepted.
     Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`; for more vehicles `fusion.window.max_vehicles`";
     /// A node of this cell with another key.
     WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";
@@ -158,7 +158,8 @@ impl TroubleKind {
         matches!(self, Self::ReportsRefused | Self::Camera | Self::NoPose)
     }
 
-    /// True if this trouble, of whatever host, may be why a node finds no leader or gets no rounds.
+    /// True if this trouble, of any host, may be the reason why a node finds no leader or gets no
+    /// rounds.
     pub fn is_separating(self) -> bool {
         matches!(
             self,
@@ -322,7 +323,7 @@ impl TroubleRegister {
         of_kind.for_each(|(_, entry)| entry.is_settled = true);
     }
 
-    /// The present troubles: the node's own first, then by vehicle or host.
+    /// The current troubles: the node's own first, then by vehicle or host.
     pub fn present(&self, now: Timestamp) -> Vec<Trouble> {
         self.entries
             .iter()

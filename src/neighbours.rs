@@ -199,7 +199,7 @@ impl Neighbours {
         self.extent.observe(objects.chain(places), now);
     }
 
-    /// The objects of others near this cell, each cell's nearest first, as their maps have them.
+    /// The objects of other cells near this cell, each cell's nearest first, as in their maps.
     pub fn near(&mut self, now: Timestamp) -> Vec<NeighbourObject> {
         self.forget_silent(now);
         let of_cell = |(cell, map): (&NodeName, &NeighbourMap)| {

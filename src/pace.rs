@@ -59,7 +59,8 @@ config_section! {
         /// Age in seconds beyond which a vehicle's last view of a landmark is ignored. Default 1.0.
         pub max_age_s: f64 = 1.0, in 0.01 to 3600.0;
         /// Probability that an object in view is detected in one frame. Default 0.3: low, so that a
-        /// few misses do not erase a reading. Higher drops labels sooner when objects leave.
+        /// few misses do not erase a reading. A higher value drops labels sooner when objects
+        /// leave.
         pub detection_probability: f64 = 0.3, in 0.01 to 0.99;
         /// Probability that one frame reports a non-existent object. Default 0.01.
         pub false_alarm_probability: f64 = 0.01, in 1e-6 to *detection_probability;

@@ -410,7 +410,7 @@ pub struct NodeStatus {
     /// The configured role.
     #[n(3)]
     pub role: Role,
-    /// The present state.
+    /// The current state.
     #[n(4)]
     pub state: NodeState,
     /// The epoch it follows or leads.

@@ -48,7 +48,7 @@ const CELLS: Range<usize> = 0..CELLS_A_SIDE * CELLS_A_SIDE;
 /// Distance in metres of a border of cells up to which a place is at the border.
 pub const BORDER_M: f64 = 25.0;
 
-/// Time that a vehicle takes to get ready in the next cell; real nodes take 0.6 to 2 s.
+/// Time that a vehicle takes to prepare in the next cell; real nodes take 0.6 to 2 s.
 const JOIN_TIME: Duration = Duration::from_secs(1);
 
 /// Maximum time between a map and the moment that it represents.
@@ -355,7 +355,7 @@ fn cell_name(number: usize) -> NodeName {
     NodeName::new(format!("cell-{number}")).expect("letters, a dash and a digit are a name")
 }
 
-/// Judges the maps of cells together.
+/// Evaluates the maps of cells together.
 fn judge(
     plan: &TownPlan,
     truth: &TrafficTruth,

@@ -6,10 +6,10 @@
 //! - A vehicle that reports less often than rounds close is waited for in the rounds in which its
 //!   next report is expected.
 //! - Vehicles often report once a period, all at about the same time, and just as a round ends. If
-//!   it ended amid their reports, the later ones would wait for another period, in every round. So
-//!   the end is delayed a little while reports come in. If a round ends amid them nevertheless, the
-//!   rest get a round as soon as the last of them has reported; later rounds then end after all of
-//!   them.
+//!   the round ended between their reports, the later reports would wait for another period, in
+//!   every round. The end is therefore delayed a little while reports arrive. If a round still ends
+//!   between them, the remaining vehicles get a round as soon as the last of them has reported;
+//!   later rounds then end after all reports.
 //!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at
 //! [`RoundTrigger::deadline`]; either returns true when the round closes.
@@ -42,8 +42,8 @@ config_section! {
 pub enum RoundClose {
     /// Only the time, as in the paper. Adds up to a period of latency.
     Periodic,
-    /// Every live vehicle has reported since the last round, at the latest the period, or a tenth
-    /// more while reports come in. The default.
+    /// Every live vehicle has reported since the last round; at the latest after the period, or a
+    /// tenth more while reports arrive. The default.
     WhenComplete,
 }
 
@@ -53,20 +53,20 @@ impl RoundConfig {
     }
 }
 
-/// The state of the present round.
+/// The state of the current round.
 #[derive(Debug, Clone)]
 pub struct RoundTrigger {
     config: RoundConfig,
     last_close: Timestamp,
-    /// Time of the first report of the present round.
+    /// Time of the first report of the current round.
     first_report: Option<Timestamp>,
     live: [BTreeMap<NodeName, Reporter>; ReportKind::COUNT],
-    /// Number of live vehicles that have not reported in the present round.
+    /// Number of live vehicles that have not reported in the current round.
     missing: usize,
     /// Number of vehicles whose report was due when the last round closed and that have not
     /// reported since.
     due: usize,
-    /// Length of the present round.
+    /// Length of the current round.
     length: Duration,
     /// True if it lasts that long even if all have reported.
     held: bool,
@@ -79,7 +79,7 @@ struct Reporter {
     last_report: Timestamp,
     /// Times between its last three reports; [`Duration::ZERO`] where it has sent fewer.
     gaps: [Duration; 2],
-    /// True if the present round waits for it: its next report is expected, and has not come.
+    /// True if the current round waits for it: its next report is expected, and has not come.
     is_awaited: bool,
     /// True if its report was due when the last round closed.
     due: bool,
@@ -183,8 +183,9 @@ impl RoundTrigger {
         self.config = config;
     }
 
-    /// Takes a report; true when it closes the round as the last missing one. [`Self::tick`] alone
-    /// closes a round whose period is over, so that it includes all reports that come at its end.
+    /// Processes a report; returns true if it closes the round as the last missing one. Only
+    /// [`Self::tick`] closes a round whose period is over, so that the round includes all reports
+    /// that arrive at its end.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
         let live = &mut self.live[kind as usize];
@@ -218,7 +219,7 @@ impl RoundTrigger {
         is_due
     }
 
-    /// Begins the next round, whether or not the present one is due.
+    /// Begins the next round, whether or not the current one is due.
     pub(super) fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
         // After a round that was held, another node may take over, or vehicles are still
@@ -259,7 +260,7 @@ impl RoundTrigger {
         self.early = if self.held { 0 } else { EARLY.len() };
     }
 
-    /// Lets the present round last its whole length, even if all have reported.
+    /// Lets the current round last its whole length, even if all have reported.
     pub fn hold(&mut self) {
         self.held = true;
     }

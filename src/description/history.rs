@@ -20,7 +20,7 @@ pub struct AttributedDescription {
     pub authors: Vec<String>,
 }
 
-/// Maximum number of candidates of which one is taken for the author of a description.
+/// Maximum number of candidates among which the author of a description is searched.
 pub(super) const MAX_AUTHORS: usize = 8;
 
 impl AttributedDescription {
@@ -40,7 +40,7 @@ impl AttributedDescription {
 /// that a node saves.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DescriptionHistory {
-    /// The present one.
+    /// The current description.
     #[serde(flatten)]
     pub current: Option<AttributedDescription>,
     /// Those before, oldest first.
@@ -65,7 +65,7 @@ impl DescriptionHistory {
         }
     }
 
-    /// Puts a description in the place of the present one.
+    /// Replaces the current description.
     pub(super) fn replace(&mut self, next: AttributedDescription) {
         let Some(before) = self.current.replace(next) else {
             return;

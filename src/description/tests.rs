@@ -82,7 +82,7 @@ fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
     }
 }
 
-/// Statement of a node that may lead and is no operator's.
+/// Statement of a node that may lead and is not an operator's.
 fn candidates(stamp: DescriptionStamp) -> DescriptionStatement {
     DescriptionStatement {
         may_describe: false,

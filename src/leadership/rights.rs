@@ -15,8 +15,8 @@ pub struct Rights {
     pub may_describe: bool,
 }
 
-/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by
-/// default. The node is no operator's.
+/// Rights of a node that is issued a certificate for a role, with the default priority of nodes.
+/// The node is not an operator's.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
         Self {

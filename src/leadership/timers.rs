@@ -190,7 +190,7 @@ pub(crate) const MAX_WAITING_QUESTIONS: usize = 64;
 /// Beats of the standby for each beat of another successor.
 const NEAR_BEATS: u32 = 8;
 
-/// Time after a round at which the next one is late: its leader is doubted.
+/// Time after a round at which the next one is late: its leader is suspected.
 pub(crate) fn overdue(round_interval: Duration) -> Duration {
     round_interval * 3 / 2
 }

@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check_range};
 use crate::model::geometry::{Pose, wrap_angle};
 
-/// Maximum distance of a pose from the origin in metres. Farther away x and y are no distances on
-/// the ground any more: 4 m less at this distance.
+/// Maximum distance of a pose from the origin in metres. At larger distances x and y deviate from
+/// distances on the ground: by 4 m at this distance.
 const MAX_DISTANCE_M: f64 = 1e5;
 
 /// Geographic origin of the east-north frame, in WGS 84.

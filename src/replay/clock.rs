@@ -30,7 +30,7 @@ impl VirtualClock {
         self.now.unwrap_or_default()
     }
 
-    /// True if a line is ahead of the present, or of most lines that follow, by at most the
+    /// True if a line is ahead of the current time, or of most lines that follow, by at most the
     /// tolerance.
     pub(super) fn is_plausible(
         &self,
@@ -49,7 +49,8 @@ impl VirtualClock {
         at.since(*median) <= self.tolerance
     }
 
-    /// Moves to the time of a line; true if the line is late, that is before the present.
+    /// Moves to the time of a line; returns true if the line is late, that is, before the current
+    /// time.
     pub(super) fn advance(&mut self, at: Timestamp) -> bool {
         let is_late = self.now.is_some_and(|now| at < now);
         if !is_late {

@@ -25,7 +25,7 @@ use crate::wire::{ObjectReport, RejectReason, ReportKind};
 /// One entry of a journal. Reports are stored separately.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct JournalEntry {
-    /// The time that the aggregator was given as the present.
+    /// The current time that was passed to the aggregator.
     pub at_us: Timestamp,
     /// The event.
     pub event: JournalEvent,
@@ -98,7 +98,7 @@ impl JournalReplay {
         (self.fusion, self.landmarks, self.aggregator) = (fusion, landmarks, None);
     }
 
-    /// Takes the next entry.
+    /// Processes the next entry.
     pub fn entry(&mut self, entry: &JournalEntry) -> Vec<FusedLine> {
         let at = entry.at_us;
         match &entry.event {
@@ -134,7 +134,7 @@ impl JournalReplay {
         }
     }
 
-    /// Takes the next report.
+    /// Processes the next report.
     pub fn report(
         &mut self,
         kind: ReportKind,
@@ -160,7 +160,7 @@ impl JournalReplay {
         Aggregator::new_standby(self.fusion.clone(), self.landmarks.clone(), at)
     }
 
-    /// The present run; a run without a recorded beginning starts as a standby.
+    /// The current run; a run without a recorded beginning starts as a standby.
     fn running(&mut self, at: Timestamp) -> &mut Aggregator {
         if self.aggregator.is_none() {
             self.summary.continued = true;

@@ -387,7 +387,7 @@ async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
             sum(nodes, Event::DetectionUnplaced)
         );
         let mut output = std::io::stderr().lock();
-        // Progress that cannot be shown is no reason to end.
+        // Failing to show progress does not end the trial.
         let _ = if output.is_terminal() {
             write!(output, "\r\x1b[K{line}").and_then(|()| output.flush())
         } else if line != shown {

@@ -473,7 +473,7 @@ impl<M> Iterator for Messages<M> {
     }
 }
 
-/// The present time by this machine's clock, to be compared with a message's `fused_at_us`.
+/// The current time by this machine's clock, for comparison with a message's `fused_at_us`.
 pub fn now() -> Timestamp {
     Timestamp::default() + SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
 }

@@ -594,8 +594,7 @@ fn example(name: &str) -> PathBuf {
     build.join("examples").join(name)
 }
 
-/// The program that a page of the documentation shows, if it is this example but for its first
-/// lines.
+/// True if a page of the documentation shows this example, apart from the example's first lines.
 fn is_shown(page: &str, example: &str) -> bool {
     let read = |path: &str| {
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()

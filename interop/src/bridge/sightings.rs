@@ -14,7 +14,7 @@ const SIGHTED_FOR: Duration = Duration::from_secs(2);
 /// speed and with any error of pose.
 const SIGHTED_M: f64 = 5.0;
 
-/// Time after a foreign station's last report in which the cell may still have its objects.
+/// Time after another station's last report in which the cell may still have its objects.
 const FOREIGN_FOR: Duration = Duration::from_secs(10);
 
 /// Detections of the cell's own vehicles, and whether other stations' objects are reported at the

@@ -7,8 +7,8 @@ use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::{NodeName, PART_MARK};
 use uuid::Uuid;
 
-/// Part of a node's name in which a foreign station's objects are reported, before the station's
-/// number.
+/// Prefix of the part of a node's name under which another station's objects are reported, before
+/// the station's number.
 pub const RECEIVED_PART: &str = "cpm-";
 
 /// True if a node's name belongs to a part that reports the objects of received messages.

@@ -107,7 +107,7 @@ impl<W: Write + Seek> RosLog<W> {
     /// Writes the messages of a log.
     ///
     /// # Errors
-    /// Returns a [`ConversionError`] if this is no log, or the output cannot be written.
+    /// Returns a [`ConversionError`] if this is not a log, or the output cannot be written.
     pub fn add(&mut self, mut log: impl Read) -> Result<(), ConversionError> {
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)

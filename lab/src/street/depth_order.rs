@@ -22,8 +22,8 @@ pub(super) fn depth_order(eye: &Point2<f64>, footprints: &[[Point2<f64>; 4]]) ->
     order
 }
 
-/// True if `a` may hide `b` and not the other way round: a side of one has the other wholly beyond
-/// it. `None` if they overlap.
+/// True if `a` may hide `b` but not vice versa: a side of one footprint has the other entirely
+/// beyond it. `None` if they overlap.
 fn is_nearer(eye: &Point2<f64>, a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<bool> {
     let parted_by_a = parting_side(a, b).map(|side| !is_beyond(side, eye));
     parted_by_a.or_else(|| parting_side(b, a).map(|side| is_beyond(side, eye)))

@@ -207,7 +207,7 @@ fn encode(picture: &Mat, quality: i32) -> opencv::Result<Vec<u8>> {
 
 async fn serve(listener: TcpListener, pictures: watch::Receiver<Jpeg>) {
     while let Ok((client, _)) = listener.accept().await {
-        // A client that goes away is no fault of the camera.
+        // A disconnecting client is not a fault of the camera.
         tokio::spawn(send(client, pictures.clone()));
     }
 }

@@ -11,7 +11,7 @@ use opencv::imgcodecs::imwrite;
 use super::camera::TestbedCamera;
 use super::{Cav, Scene, Testbed};
 
-/// Frames that are rendered; they are played again and again.
+/// Number of rendered frames; they are played repeatedly.
 const FRAMES: u64 = 50;
 
 /// Renders the vehicle's first frames into `directory`, without loss. The returned source plays

@@ -79,7 +79,7 @@ pub struct IntersectionResult {
     pub name: String,
     /// Number of scenes that it is the mean of: 1 for a recording.
     pub scenes: u64,
-    /// Number of verdicts that were judged: one for every object and frame.
+    /// Number of verdicts that were evaluated: one for every object and frame.
     pub verdicts: u64,
     /// Right verdicts in percent, default mode.
     pub vote_accuracy_pct: f64,
@@ -242,8 +242,8 @@ pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<Strin
     serde_json::to_string(&line)
 }
 
-/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both,
-/// the maps are judged.
+/// The maps or verdicts of these algorithms and their accuracy, each frame separately; with both
+/// algorithms, the maps are evaluated.
 fn fuse(
     recording: &IntersectionRecording,
     reports: &[ObjectReport],

@@ -80,8 +80,8 @@ fn readings(fused: &Fused) -> Vec<(String, Vec<String>)> {
         .collect()
 }
 
-/// A vehicle at the side reads the sign behind a plate: that is no vote against the plate, and the
-/// vehicle is not wrong.
+/// A vehicle at the side reads the sign behind a plate: this is not a vote against the plate, and
+/// the vehicle does not count as wrong.
 #[test]
 fn a_sign_behind_a_plate_is_no_vote_against_it() {
     let mut lot = Lot::new();

@@ -87,7 +87,7 @@ impl Increments {
 }
 
 impl VehicleBelief {
-    /// Keeps the beliefs about places that there still are, under their present numbers.
+    /// Keeps the beliefs about places that still exist, under their new numbers.
     pub(super) fn move_places(&mut self, place_now: impl Fn(Place) -> Option<Place>) {
         let known = std::mem::take(&mut self.places)
             .into_iter()

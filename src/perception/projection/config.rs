@@ -54,8 +54,8 @@ pub struct ObjectSize {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub length_m: Option<f64>,
     /// Relative standard deviation of sizes of this kind and of the focal length together; default
-    /// 0.02. Too small makes positions over-confident along the line of sight; too large makes them
-    /// count less in fusion.
+    /// 0.02. A value that is too small makes positions over-confident along the line of sight; one
+    /// that is too large makes them count less in fusion.
     #[serde(default = "default_relative_sigma")]
     pub relative_sigma: f64,
 }

@@ -70,8 +70,8 @@ const ROLL_PRIOR_RAD: f64 = 0.17;
 /// Pitches and rolls in degrees from which the search starts.
 const PITCHES_DEG: std::ops::RangeInclusive<i32> = -20..=80;
 const ROLLS_DEG: [f64; 3] = [0.0, -12.0, 12.0];
-/// Standard deviations of the tilt in radians and of the height, relative, because people are no
-/// boxes and detectors cut legs off: the errors in the tests.
+/// Standard deviations of the tilt in radians and of the height (relative) due to the model: people
+/// are not boxes, and detectors cut off legs. The values are the errors in the tests.
 const MODEL_TILT_RAD: f64 = 0.007;
 const MODEL_HEIGHT: f64 = 0.02;
 /// Maximum standard deviation in degrees of a pitch that is worth reporting.

@@ -36,7 +36,7 @@ pub(super) enum TermState {
     Refused,
     /// The disk has not answered.
     Unanswered,
-    /// There is no disk.
+    /// The node has no disk for its state.
     NoDisk,
 }
 

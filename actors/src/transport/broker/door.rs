@@ -64,7 +64,7 @@ pub struct DoorSetup {
     pub fuses: Arc<dyn Fn(ReportKind) -> bool + Send + Sync>,
     /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
-    /// Takes a program's report for the cell.
+    /// Processes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
     /// Sets the cell's description, given as TOML, or returns the reason for refusing it.
     pub describe: Arc<dyn Fn(String) -> Result<(), String> + Send + Sync>,
@@ -80,7 +80,7 @@ pub struct Door(Option<Arc<DoorState>>);
 
 struct DoorState {
     setup: DoorSetup,
-    /// To the broker's present run.
+    /// Queue to the broker's current run.
     queue: Mutex<Option<mpsc::Sender<Publication>>>,
     /// Last message of each topic that is retained, for the broker's next run.
     retained: Mutex<BTreeMap<String, Bytes>>,
@@ -320,7 +320,8 @@ impl DoorState {
         })
     }
 
-    /// Hands a message to the broker's present run, if there is one; false if it has no room.
+    /// Passes a message to the broker's current run, if there is one; returns false if it has no
+    /// room.
     fn send(&self, publication: Publication) -> bool {
         let queue = lock(&self.queue);
         let has_room = queue

@@ -10,8 +10,8 @@ use tokio::net::lookup_host;
 /// Resolves the seeds repeatedly, sooner while one has failed, until `tell` returns false.
 /// `trouble` is called for each failure.
 ///
-/// A seed that fails keeps its addresses: the name server may be unreachable together with the
-/// network.
+/// A seed whose resolution fails keeps its addresses: the name server may be unreachable together
+/// with the network.
 pub(crate) async fn resolve(
     seeds: Vec<String>,
     ipv4: bool,

@@ -5,7 +5,7 @@ use super::frame::{FrameHeader, HEADER_BYTES};
 use super::key::FrameCipher;
 use super::replay_window::ReplayWindow;
 
-/// Keys that one handshake gave, both directions.
+/// Keys resulting from one handshake, for both directions.
 pub(crate) struct KeySet {
     pub(crate) to: FrameCipher,
     pub(crate) from: FrameCipher,
@@ -61,7 +61,7 @@ impl KeyRing {
         })
     }
 
-    /// Takes the counter of a frame that was opened otherwise.
+    /// Records the counter of a frame that was opened by other means.
     pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
         self.sets
             .first_mut()

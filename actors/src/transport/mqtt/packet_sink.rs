@@ -26,7 +26,7 @@ pub(crate) enum PacketOutcome {
     Namesake(Uuid),
 }
 
-/// Receiver of the messages that come in on links.
+/// Receiver of the messages that arrive on links.
 pub(crate) trait PacketSink: Send + Sync {
     /// Processes one packet of a broker, on the link's task; it must not block.
     fn accept(

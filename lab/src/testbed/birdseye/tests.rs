@@ -6,7 +6,7 @@ use super::*;
 const SETUP1: &str = include_str!("../../../../examples/testbed/pace_setup1.json");
 const SETUP2: &str = include_str!("../../../../examples/testbed/pace_setup2.json");
 
-/// A map that reads the truth, but for the given spots.
+/// A map with the true labels, except at the given spots.
 fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> GlobalMap {
     let state = |spot: &Spot| {
         let label = spot

@@ -48,7 +48,7 @@ struct Glimpse {
 }
 
 impl<'a> ConfusionModel<'a> {
-    /// Takes a recording apart by the locations that its detections are taken for.
+    /// Divides a recording by the locations to which its detections are assigned.
     pub fn of(recording: &'a IntersectionRecording) -> Self {
         let cavs = recording.cavs.len();
         let mut views = vec![vec![View::default(); cavs]; recording.objects.len()];

@@ -28,11 +28,11 @@ impl Authority {
         })
     }
 
-    /// Makes a CA for a cell of this city.
+    /// Creates a CA for a cell of this city.
     ///
     /// # Errors
-    /// Returns an [`AuthorityError`] if this is no city, there is a CA or a directory cannot be
-    /// written.
+    /// Returns an [`AuthorityError`] if this is not a city, there is a CA already, or a directory
+    /// cannot be written.
     pub fn init_cell(
         &mut self,
         directory: &Path,
