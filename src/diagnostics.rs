@@ -323,7 +323,7 @@ impl TroubleRegister {
         of_kind.for_each(|(_, entry)| entry.is_settled = true);
     }
 
-    /// The present troubles: the node's own first, then by vehicle or host.
+    /// The current troubles: the node's own first, then by vehicle or host.
     pub fn present(&self, now: Timestamp) -> Vec<Trouble> {
         self.entries
             .iter()

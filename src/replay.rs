@@ -212,8 +212,8 @@ impl Replay {
         }
     }
 
-    /// Takes the next line, without its line end; returns the output that is ready. Blank lines are
-    /// ignored.
+    /// Processes the next line, without its line end; returns the output that is ready. Blank lines
+    /// are ignored.
     pub fn line(&mut self, text: &[u8]) -> Vec<FusedLine> {
         self.number += 1;
         if text.trim_ascii().is_empty() {
@@ -223,7 +223,7 @@ impl Replay {
         self.push(RecordedReport::read(text, &self.config.limits))
     }
 
-    /// Takes the next report of a recording without lines; it counts as one line.
+    /// Processes the next report of a recording without lines; it counts as one line.
     pub fn report(
         &mut self,
         kind: ReportKind,
@@ -251,8 +251,8 @@ impl Replay {
         self.reject(self.number, flaw::too_large(&self.config.limits));
     }
 
-    /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet
-    /// of VOTE's `paper` mode.
+    /// Processes the lines that were read ahead, closes the last round, and judges an incomplete
+    /// packet of VOTE's `paper` mode.
     pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
         let mut output = Vec::new();
         while !self.ahead.is_empty() {
@@ -308,7 +308,7 @@ impl Replay {
         }
     }
 
-    /// Takes the oldest of the lines that were read ahead.
+    /// Processes the oldest of the lines that were read ahead.
     fn process_next(&mut self) -> Vec<FusedLine> {
         let mut output = Vec::new();
         let Some((number, mut line)) = self.ahead.pop_front() else {

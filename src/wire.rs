@@ -154,15 +154,15 @@ pub struct WirePose {
     /// Direction of the camera's axis in radians, counter-clockwise from east.
     #[cbor(n(2), with = "Single")]
     pub heading_rad: f64,
-    /// Height of the camera above the ground in metres; absent if it is not configured.
+    /// Height of the camera above the ground in metres; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(3), with = "Millimetres", has_nil)]
     pub height_m: Option<f64>,
-    /// Angle of the camera's axis below the horizon in radians; absent if it is not configured.
+    /// Angle of the camera's axis below the horizon in radians; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(4), with = "Single", has_nil)]
     pub pitch_rad: Option<f64>,
-    /// Angle in radians by which the camera leans to its right; absent if it is not configured.
+    /// Angle in radians by which the camera leans to its right; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(5), with = "Single", has_nil)]
     pub roll_rad: Option<f64>,
@@ -410,7 +410,7 @@ pub struct NodeStatus {
     /// The configured role.
     #[n(3)]
     pub role: Role,
-    /// The present state.
+    /// The current state.
     #[n(4)]
     pub state: NodeState,
     /// The epoch it follows or leads.

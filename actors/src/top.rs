@@ -34,7 +34,7 @@ pub struct CellView {
     pub cell: NodeName,
     /// Age from which the newest round counts as stale, if rounds are periodic.
     pub patience: Option<Duration>,
-    /// The present time.
+    /// The current time.
     pub now: Timestamp,
     /// The leadership.
     pub leadership: Leadership,

@@ -39,7 +39,7 @@ pub(crate) trait RosSink {
     /// Error if a message was not accepted.
     type Error;
 
-    /// Takes a message.
+    /// Processes a message.
     fn put<M: Serialize + Definition>(
         &mut self,
         topic: &str,

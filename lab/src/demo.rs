@@ -44,7 +44,7 @@ pub struct Demo<'a> {
     pub testbed: &'a Testbed,
     /// The scene.
     pub scene: &'a Scene,
-    /// Time for which the maps are judged.
+    /// Time for which the maps are evaluated.
     pub duration: Duration,
     /// Directory for configurations and logs.
     pub directory: &'a Path,

@@ -179,7 +179,7 @@ impl Evaluation {
         self
     }
 
-    /// Judges one line of output.
+    /// Evaluates one line of output.
     pub fn fused(&mut self, line: &FusedLine) {
         match line {
             FusedLine::Map(map) => {

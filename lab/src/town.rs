@@ -355,7 +355,7 @@ fn cell_name(number: usize) -> NodeName {
     NodeName::new(format!("cell-{number}")).expect("letters, a dash and a digit are a name")
 }
 
-/// Judges the maps of cells together.
+/// Evaluates the maps of cells together.
 fn judge(
     plan: &TownPlan,
     truth: &TrafficTruth,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::model::time::Timestamp;
 
-/// Candidate for the clock of a sender whose stamps contradict the present estimate.
+/// Candidate for the clock of a sender whose stamps contradict the current estimate.
 ///
 /// Messages that waited in a queue arrive faster than they were made. A stream that keeps its delay
 /// for a second is live, even if its clock is wrong.

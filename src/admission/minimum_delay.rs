@@ -35,8 +35,8 @@ impl MinimumDelay {
         }
     }
 
-    /// Takes the delay of one message in microseconds, which is negative if the sender's clock is
-    /// ahead.
+    /// Processes the delay of one message in microseconds, which is negative if the sender's clock
+    /// is ahead.
     pub fn observe(&mut self, delay_us: i64, now: Timestamp) {
         if now.since(self.span_start) >= self.span {
             self.previous_us = self.current_us;

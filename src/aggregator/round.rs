@@ -53,20 +53,20 @@ impl RoundConfig {
     }
 }
 
-/// The state of the present round.
+/// The state of the current round.
 #[derive(Debug, Clone)]
 pub struct RoundTrigger {
     config: RoundConfig,
     last_close: Timestamp,
-    /// Time of the first report of the present round.
+    /// Time of the first report of the current round.
     first_report: Option<Timestamp>,
     live: [BTreeMap<NodeName, Reporter>; ReportKind::COUNT],
-    /// Number of live vehicles that have not reported in the present round.
+    /// Number of live vehicles that have not reported in the current round.
     missing: usize,
     /// Number of vehicles whose report was due when the last round closed and that have not
     /// reported since.
     due: usize,
-    /// Length of the present round.
+    /// Length of the current round.
     length: Duration,
     /// True if it lasts that long even if all have reported.
     held: bool,
@@ -79,7 +79,7 @@ struct Reporter {
     last_report: Timestamp,
     /// Times between its last three reports; [`Duration::ZERO`] where it has sent fewer.
     gaps: [Duration; 2],
-    /// True if the present round waits for it: its next report is expected, and has not come.
+    /// True if the current round waits for it: its next report is expected, and has not come.
     is_awaited: bool,
     /// True if its report was due when the last round closed.
     due: bool,
@@ -219,7 +219,7 @@ impl RoundTrigger {
         is_due
     }
 
-    /// Begins the next round, whether or not the present one is due.
+    /// Begins the next round, whether or not the current one is due.
     pub(super) fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
         // After a round that was held, another node may take over, or vehicles are still
@@ -260,7 +260,7 @@ impl RoundTrigger {
         self.early = if self.held { 0 } else { EARLY.len() };
     }
 
-    /// Lets the present round last its whole length, even if all have reported.
+    /// Lets the current round last its whole length, even if all have reported.
     pub fn hold(&mut self) {
         self.held = true;
     }

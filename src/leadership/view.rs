@@ -11,7 +11,7 @@ use crate::model::names::NodeName;
 pub struct Leadership {
     /// The node's own place in its cell.
     pub position: Position,
-    /// Highest epoch followed or led so far; its leader is the present one unless the node seeks.
+    /// Highest epoch followed or led so far; its leader is the current one unless the node seeks.
     pub epoch: Option<Epoch>,
     /// The next leader, if the leader has named one; it may be this node.
     pub standby: Option<NodeName>,

@@ -25,7 +25,7 @@ struct Rectangle {
 impl Extent {
     const SPAN: Duration = Duration::from_secs(30);
 
-    /// Takes the places in a map at `now`.
+    /// Processes the places in a map at `now`.
     pub(super) fn observe(&mut self, places: impl Iterator<Item = Point2<f64>>, now: Timestamp) {
         if now.since(self.span_start) >= Self::SPAN {
             (self.previous, self.current, self.span_start) = (self.current.take(), None, now);

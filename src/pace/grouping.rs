@@ -15,7 +15,7 @@ impl Place {
     }
 }
 
-/// The present number of each place that belongs to a landmark which is still there, of
+/// The current number of each place that belongs to a landmark which is still there, of
 /// `per_landmark` places each.
 pub(super) fn places_after(
     before: Arc<LandmarkIndex>,

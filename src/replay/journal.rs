@@ -98,7 +98,7 @@ impl JournalReplay {
         (self.fusion, self.landmarks, self.aggregator) = (fusion, landmarks, None);
     }
 
-    /// Takes the next entry.
+    /// Processes the next entry.
     pub fn entry(&mut self, entry: &JournalEntry) -> Vec<FusedLine> {
         let at = entry.at_us;
         match &entry.event {
@@ -134,7 +134,7 @@ impl JournalReplay {
         }
     }
 
-    /// Takes the next report.
+    /// Processes the next report.
     pub fn report(
         &mut self,
         kind: ReportKind,

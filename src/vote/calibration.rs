@@ -142,7 +142,7 @@ impl ConfidenceCalibration {
         self.live = BandCounts::default();
     }
 
-    /// The present weights of votes.
+    /// The current weights of votes.
     pub(super) fn weights(&self) -> Weights {
         let mut bands = self.settled.clone();
         for band in 0..BANDS {

@@ -129,7 +129,7 @@ impl Actor for Recorder {
     }
 }
 
-/// Requests a record of the present leadership and of every change; ends with the recorder.
+/// Requests a record of the current leadership and of every change; ends with the recorder.
 async fn watch_leadership(
     mut leadership: watch::Receiver<Leadership>,
     recorder: ActorRef<RecorderMessage>,

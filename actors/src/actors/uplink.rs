@@ -74,7 +74,7 @@ pub struct UplinkArguments {
     pub description: Option<Arc<CellDescription>>,
     /// The newest map of the cell.
     pub newest: watch::Receiver<Option<ReceivedMap>>,
-    /// The present leadership.
+    /// The current leadership.
     pub leadership: watch::Receiver<Leadership>,
     /// Receives the objects of neighbours and other cells' counts about vehicles.
     pub fuser: ActorSlot<FuserMessage>,

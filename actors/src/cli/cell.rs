@@ -36,7 +36,7 @@ pub(super) enum CellCommand {
         #[command(flatten)]
         door: DoorArguments,
     },
-    /// Set the description again that this machine's node had before the present one
+    /// Set the description again that this machine's node had before the current one
     Undo {
         #[command(flatten)]
         door: DoorArguments,
@@ -137,7 +137,7 @@ async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     ))?)
 }
 
-/// The text of the description that this machine's node had before the present one.
+/// The text of the description that this machine's node had before the current one.
 fn text_before(config: &NodeConfig) -> Result<String, anyhow::Error> {
     let file = description_file(config)
         .context("this node keeps no earlier description: it has no `state_dir`")?;

@@ -20,7 +20,7 @@ impl<M: Message> ActorSlot<M> {
         *self.actor.write().unwrap_or_else(PoisonError::into_inner) = Some(actor);
     }
 
-    /// The present run of the actor, if there is one.
+    /// The current run of the actor, if there is one.
     pub fn get(&self) -> Option<ActorRef<M>> {
         self.actor
             .read()
@@ -28,7 +28,7 @@ impl<M: Message> ActorSlot<M> {
             .clone()
     }
 
-    /// Sends to the present run; false when the slot is empty or the actor has just ended.
+    /// Sends to the current run; false if the slot is empty or the actor has just ended.
     pub fn send(&self, message: M) -> bool {
         self.get().is_some_and(|actor| actor.cast(message).is_ok())
     }

@@ -3,7 +3,7 @@
 /// Requests to the recorder.
 #[derive(Debug)]
 pub enum RecorderMessage {
-    /// Record the present leadership.
+    /// Record the current leadership.
     RecordLeadership,
     /// Record the counters, and check that the writer runs.
     Tick,

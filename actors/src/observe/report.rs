@@ -33,13 +33,13 @@ use timeline::{GAP, LogTimeline, RecordedPicture, cell_offset_us};
 
 /// Additional section of the page, made from the messages of the log in their order.
 pub trait Section: Debug {
-    /// Takes the identity at the beginning of a file.
+    /// Processes the identity at the beginning of a file.
     fn identity(&mut self, identity: &LogIdentity);
 
-    /// Takes a vehicle's report.
+    /// Processes a vehicle's report.
     fn report(&mut self, kind: ReportKind, report: &ObjectReport);
 
-    /// Takes a map or verdicts.
+    /// Processes a map or verdicts.
     fn round(&mut self, round: &FusedLine);
 
     /// The section as HTML, made with [`section`], [`table`], [`drawing`] and [`bars`] like the
@@ -66,7 +66,7 @@ pub struct Report {
     reputations: BTreeMap<NodeName, Samples>,
     losses: Losses,
     timeline: LogTimeline,
-    /// From the clock of the recording node to the cell's time in the present file.
+    /// From the clock of the recording node to the cell's time in the current file.
     offset_us: i64,
     sections: Vec<Box<dyn Section>>,
 }

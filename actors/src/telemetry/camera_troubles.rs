@@ -1,4 +1,4 @@
-//! The present troubles of one camera of a node.
+//! The current troubles of one camera of a node.
 
 use std::sync::Arc;
 

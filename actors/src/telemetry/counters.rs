@@ -225,7 +225,7 @@ impl Counters {
         self.rejects_by_source.count(reason, source);
     }
 
-    /// The node's present troubles.
+    /// The node's current troubles.
     pub fn troubles(&self) -> &Troubles {
         &self.troubles
     }

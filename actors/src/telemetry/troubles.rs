@@ -61,7 +61,7 @@ impl Troubles {
             .for_each(|kind| register.settle_all(kind));
     }
 
-    /// The present troubles, the node's own first.
+    /// The current troubles, the node's own first.
     pub fn present(&self) -> Vec<Trouble> {
         self.register().present(clock::now())
     }

@@ -38,7 +38,7 @@ pub(super) struct DemoArguments {
     /// Run this scene only; `street` is the street
     #[arg(long, value_name = "NAME")]
     scene: Option<String>,
-    /// Time for which each scene is judged
+    /// Time for which each scene is evaluated
     #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
     /// Directory for results, pictures, configurations and logs

@@ -29,7 +29,7 @@ pub(super) struct TestbedArguments {
     /// Run this scene only; of recorded detections, `recording` or `generated`
     #[arg(long, value_name = "NAME")]
     pub(super) scene: Option<String>,
-    /// Fused maps to judge in each scene
+    /// Fused maps to evaluate in each scene
     #[arg(long, default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     verdicts: u64,
     /// Seed of everything that varies from frame to frame

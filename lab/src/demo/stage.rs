@@ -22,7 +22,7 @@ use crate::node_process::{NodeProcess, free_address};
 /// Progress of a running demo.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress {
-    /// Time judged so far.
+    /// Time evaluated so far.
     pub elapsed: Duration,
     /// Event since the last call.
     pub news: News,
@@ -43,7 +43,7 @@ pub enum News {
 #[derive(Debug)]
 pub(super) struct Played {
     pub(super) reports: Vec<ObservedReport>,
-    /// The time to be judged.
+    /// The time to be evaluated.
     pub(super) from: Timestamp,
     pub(super) until: Timestamp,
     pub(super) killed_at: Option<Timestamp>,
@@ -56,7 +56,8 @@ const START_TIMEOUT: Duration = Duration::from_secs(20);
 /// Time for which the edge is gone.
 const EDGE_GONE: Duration = Duration::from_secs(1);
 
-/// Time from the first reports of all vehicles to the first map that is judged: the memory of PACE.
+/// Time from the first reports of all vehicles to the first map that is evaluated: the memory of
+/// PACE.
 const SETTLING: Duration = Duration::from_secs(1);
 
 /// Addresses of a node: of its broker, for other nodes, and for poses.

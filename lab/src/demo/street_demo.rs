@@ -48,7 +48,7 @@ use crate::street::{Carrier, Street, StreetCamera};
 pub struct StreetDemo<'a> {
     /// The program that is run as every node.
     pub program: &'a Path,
-    /// Time for which the maps are judged.
+    /// Time for which the maps are evaluated.
     pub duration: Duration,
     /// Directory for configurations and logs.
     pub directory: &'a Path,
@@ -102,7 +102,7 @@ pub struct KnownShare {
     pub recall_pct: f64,
 }
 
-/// Time between two moments that are judged.
+/// Time between two moments that are evaluated.
 const STEP: Duration = Duration::from_millis(100);
 
 /// Time between two poses of a vehicle that drives.

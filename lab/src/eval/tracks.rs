@@ -168,7 +168,7 @@ pub struct ThresholdScores {
     pub loca_pct: Option<f64>,
 }
 
-/// Judges frames that follow each other in time.
+/// Evaluates frames that follow each other in time.
 pub fn score(frames: &[ScoredFrame]) -> TrackScores {
     let count = |of: fn(&ScoredFrame) -> usize| frames.iter().map(|frame| of(frame) as u64).sum();
     let class_ap_pct = precision::by_class(frames);
@@ -263,7 +263,7 @@ impl TrackEvaluation {
         }
     }
 
-    /// Takes the next map.
+    /// Processes the next map.
     pub fn map(&mut self, map: &GlobalMap) {
         let ids = &mut self.ids;
         let said = map.objects.iter().map(|object| SaidObject::of(object, ids));

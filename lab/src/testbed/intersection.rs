@@ -79,7 +79,7 @@ pub struct IntersectionResult {
     pub name: String,
     /// Number of scenes that it is the mean of: 1 for a recording.
     pub scenes: u64,
-    /// Number of verdicts that were judged: one for every object and frame.
+    /// Number of verdicts that were evaluated: one for every object and frame.
     pub verdicts: u64,
     /// Right verdicts in percent, default mode.
     pub vote_accuracy_pct: f64,

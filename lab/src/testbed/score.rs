@@ -83,7 +83,7 @@ pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) ->
 pub struct SceneResult {
     /// The scene's name.
     pub name: String,
-    /// Number of fused maps that were judged.
+    /// Number of fused maps that were evaluated.
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,

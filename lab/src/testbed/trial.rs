@@ -28,7 +28,7 @@ pub struct Trial<'a> {
     pub testbed: &'a Testbed,
     /// The scene.
     pub scene: &'a Scene,
-    /// Number of fused maps to judge.
+    /// Number of fused maps to evaluate.
     pub verdicts: u64,
     /// Seed of everything that varies from frame to frame.
     pub seed: u64,

@@ -61,7 +61,7 @@ impl Walker {
         }
     }
 
-    /// The present speed.
+    /// The current speed.
     pub(super) fn speed_mps(&self) -> f64 {
         if self.pauses_for_s > 0.0 {
             0.0

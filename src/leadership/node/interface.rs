@@ -34,7 +34,7 @@ pub struct NodeSettings {
 pub struct SeenMember {
     /// Its name.
     pub name: NodeName,
-    /// Start of its present run, in Unix microseconds by its own clock.
+    /// Start of its current run, in Unix microseconds by its own clock.
     pub run: u64,
     /// Its broker, if it has one.
     pub broker: Option<BrokerAddress>,
@@ -190,7 +190,7 @@ pub enum Effect {
         /// Time at which it is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole length: another node is about to lead from the next one
+    /// Let the current round last its whole length: another node is about to lead from the next one
     /// on.
     HoldRound,
     /// Stop publishing in this epoch.

@@ -118,7 +118,7 @@ async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more
     assert!(fuser.last_map.is_none());
 }
 
-/// The fuser's present troubles, as their subjects, kinds and causes.
+/// The fuser's current troubles, as their subjects, kinds and causes.
 fn troubles(fuser: &FuserState) -> Vec<(Option<String>, String, String)> {
     let all = fuser.counters.troubles().present().into_iter();
     all.map(|trouble| (trouble.about, trouble.kind, trouble.cause))

@@ -124,7 +124,7 @@ impl RegionLink {
         self.link.state == LinkState::Up
     }
 
-    /// Subscribes to these filters; false when there is no room.
+    /// Subscribes to these filters; false if there is no room.
     pub(super) fn subscribe(&self, filters: &[String]) -> bool {
         self.link
             .client

@@ -186,7 +186,7 @@ impl<'a> LogReplay<'a> {
         self.engine.insert(engine)
     }
 
-    /// Configuration of the present run.
+    /// Configuration of the current run.
     fn config(&self) -> ReplayConfig {
         let config = match (self.cell, &self.identity) {
             (Some(cell), _) => cell.clone(),

@@ -129,7 +129,7 @@ impl History {
         .concat()
     }
 
-    /// Takes the present leadership.
+    /// Processes the current leadership.
     pub(crate) fn add_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
         let present = leadership
             .epoch
@@ -166,7 +166,7 @@ impl History {
         );
     }
 
-    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's
+    /// Processes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's
     /// clock.
     pub(crate) fn add_round(
         &mut self,

@@ -145,7 +145,7 @@ impl Timeline {
         self.troubled = troubled;
     }
 
-    /// Takes the newest reputations.
+    /// Processes the newest reputations.
     pub(crate) fn reputations(&mut self, newest: &Reputations, now: Timestamp) {
         for (name, it) in &newest.reputations {
             if it.score >= TRUSTED_SCORE {

@@ -35,7 +35,7 @@ pub(crate) struct EncodedMessage<'a> {
 
 /// Destination of messages: a file or the live viewers.
 pub(crate) trait MessageSink {
-    /// Takes a message.
+    /// Processes a message.
     ///
     /// # Errors
     /// Returns an error if it cannot be kept; the remaining messages of its entry are then skipped.

@@ -47,7 +47,7 @@ pub(super) struct Losses {
 }
 
 impl Losses {
-    /// Takes the next reading. The first one is the baseline; later runs count from zero.
+    /// Processes the next reading. The first one is the baseline; later runs count from zero.
     pub(super) fn add(&mut self, run: Option<Uuid>, reading: CounterReading) {
         if let Some((run_before, before)) = &self.newest {
             let before: BTreeMap<_, _> = counts(before).filter(|_| *run_before == run).collect();

@@ -102,12 +102,12 @@ pub(super) fn cell_offset_us(path: &Path) -> Result<i64, LogError> {
 }
 
 impl LogTimeline {
-    /// Takes the identity at the beginning of a file.
+    /// Processes the identity at the beginning of a file.
     pub(super) fn identity(&mut self, identity: &LogIdentity) {
         self.landmarks = identity.landmarks.iter().map(LandmarkFacts::from).collect();
     }
 
-    /// Takes the time of the next message.
+    /// Processes the time of the next message.
     pub(super) fn advance(&mut self, now: Timestamp) {
         let before = self.last_at.replace(now);
         if let Some(silence) = before
@@ -119,7 +119,7 @@ impl LogTimeline {
         }
     }
 
-    /// Takes a vehicle's report.
+    /// Processes a vehicle's report.
     pub(super) fn report(&mut self, kind: ReportKind, report: &ObjectReport, now: Timestamp) {
         self.vehicles.update(
             &Incoming::Report {
@@ -130,7 +130,7 @@ impl LogTimeline {
         );
     }
 
-    /// Takes a node's status.
+    /// Processes a node's status.
     pub(super) fn status(&mut self, status: NodeStatus, now: Timestamp) {
         self.statuses.insert(status.node.clone(), status);
         let alive = || {
@@ -154,7 +154,7 @@ impl LogTimeline {
         self.timeline.reputations(reputations, now);
     }
 
-    /// Takes a map.
+    /// Processes a map.
     pub(super) fn map(&mut self, map: &GlobalMap, now: Timestamp) {
         self.frame(Some(map), now);
     }
@@ -170,7 +170,7 @@ impl LogTimeline {
         }
     }
 
-    /// Takes an image.
+    /// Processes an image.
     pub(super) fn picture(&mut self, picture: RecordedPicture, at_us: Timestamp) {
         self.pictures
             .push(at_us, || json(&RecordedPicture { at_us, ..picture }));

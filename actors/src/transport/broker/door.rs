@@ -64,7 +64,7 @@ pub struct DoorSetup {
     pub fuses: Arc<dyn Fn(ReportKind) -> bool + Send + Sync>,
     /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
-    /// Takes a program's report for the cell.
+    /// Processes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
     /// Sets the cell's description, given as TOML, or returns the reason for refusing it.
     pub describe: Arc<dyn Fn(String) -> Result<(), String> + Send + Sync>,

@@ -28,7 +28,7 @@ impl ThreadHeartbeat {
         Arc::clone(&self.beats)
     }
 
-    /// Checks the thread; true when it hangs.
+    /// Checks the thread; true if it hangs.
     pub(super) fn has_stopped(&mut self, now: Timestamp) -> bool {
         let beats = self.beats.load(Ordering::Relaxed);
         if beats != self.seen {

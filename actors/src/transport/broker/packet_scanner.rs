@@ -5,7 +5,7 @@
 pub(super) struct PacketScanner {
     /// The part of the fixed header that has arrived.
     header: Vec<u8>,
-    /// Bytes of the present packet that are still to come.
+    /// Bytes of the current packet that are still to come.
     rest: usize,
 }
 

@@ -110,7 +110,7 @@ struct RetainedIndex {
 }
 
 impl RetainedIndex {
-    /// Records a message in place of its topic's last; false when there is no room.
+    /// Records a message in place of its topic's last; false if there is no room.
     fn insert(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
         if !self.has_room(topic, bytes)
             && self

@@ -207,7 +207,7 @@ fn is_safe_name(host: &str) -> bool {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> WebSocketBytes<S> {
-    /// Takes the next message with content. The end of the socket is `None`.
+    /// Processes the next message with content. The end of the socket is `None`.
     fn poll_message(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<Option<Bytes>>> {
         loop {
             let next = Pin::new(&mut self.socket).poll_next(cx);

@@ -54,7 +54,7 @@ impl TrialAuthority {
         Self::read(&files, name)
     }
 
-    /// The identity of a node with its last certificate and the present revocation list.
+    /// The identity of a node with its last certificate and the current revocation list.
     #[expect(clippy::expect_used, reason = "a test ends without its certificate")]
     pub(crate) fn read(files: &TlsConfig, name: &str) -> Identity {
         let credentials = Credentials::load(files, &NodeName::new(name).expect("a name"))

@@ -249,7 +249,7 @@ pub(crate) fn open(
 }
 
 impl Client {
-    /// Queues a message; false when there is no room or the connection has ended.
+    /// Queues a message; false if there is no room or the connection has ended.
     pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
         let retain = matches!(retention, Retention::Retained | Retention::Repeated);
         let is_acknowledged = matches!(retention, Retention::Retained | Retention::Acknowledged);
@@ -277,7 +277,7 @@ impl Client {
         }
     }
 
-    /// Queues one subscription to all filters; false when there is no room.
+    /// Queues one subscription to all filters; false if there is no room.
     pub(crate) fn subscribe(&self, filters: &[String], max_qos: MaxQos) -> bool {
         match self {
             Self::V311(client) => {
@@ -303,7 +303,7 @@ impl Client {
         }
     }
 
-    /// Queues unsubscriptions; false when there is no room for all.
+    /// Queues unsubscriptions; false if there is no room for all.
     pub(crate) fn unsubscribe(&self, filters: &[String]) -> bool {
         filters.iter().all(|filter| match self {
             Self::V311(client) => client.try_unsubscribe(filter).is_ok(),
@@ -311,8 +311,7 @@ impl Client {
         })
     }
 
-    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no
-    /// room.
+    /// Queues DISCONNECT, after which the broker publishes no last will; false if there is no room.
     pub(crate) fn disconnect(&self) -> bool {
         match self {
             Self::V311(client) => client.try_disconnect().is_ok(),

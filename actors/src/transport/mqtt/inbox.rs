@@ -373,7 +373,7 @@ impl Inbox {
         PacketOutcome::Done
     }
 
-    /// Counts a message of a node that sends too many; false when there is still room for it.
+    /// Counts a message of a node that sends too many; false if there is still room for it.
     fn is_shed(
         &self,
         throttle: &NodeThrottle,

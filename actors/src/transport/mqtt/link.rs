@@ -121,15 +121,15 @@ impl Link {
         }
     }
 
-    /// Queues a message; false when there is no connection or no room.
+    /// Queues a message; false if there is no connection or no room.
     pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
         self.client
             .as_ref()
             .is_some_and(|client| client.publish(topic, payload, retention))
     }
 
-    /// Records a message whose echo is expected, even if there was no room to send it; true when
-    /// the broker is stalled.
+    /// Records a message whose echo is expected, even if there was no room to send it; true if the
+    /// broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
         let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {

@@ -51,7 +51,7 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
         .as_ref()
         .filter(|said| said.len() > 1 || truth.len() > 1)
     {
-        // Part of the sequences may be judged.
+        // Part of the sequences may be evaluated.
         truth.retain(|sequence| said.iter().any(|other| other.name == sequence.name));
         if let Some(other) = said
             .iter()

@@ -14,7 +14,7 @@ use nalgebra::Point2;
 
 use super::{Cells, FilePlace, LineError, ParsedObject};
 
-/// The classes that the benchmark judges. Others, such as vans, are left out.
+/// The classes that the benchmark evaluates. Others, such as vans, are left out.
 const CLASSES: [&str; 3] = ["Pedestrian", "Car", "Cyclist"];
 
 pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineError> {

@@ -280,7 +280,7 @@ fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
     }
 }
 
-/// An object at ten metres a frame, judged by maps about the frames, with one lost.
+/// An object at ten metres a frame, evaluated by maps about the frames, with one lost.
 #[test]
 fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
     let frames: Vec<_> = (0..6)

@@ -107,7 +107,7 @@ impl Door {
             .is_some_and(|door| door.may_say(principal, topic).is_ok())
     }
 
-    /// Takes a program's message.
+    /// Processes a program's message.
     pub(in crate::transport::broker) fn take(
         &self,
         principal: &Principal,
