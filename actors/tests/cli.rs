@@ -1,7 +1,6 @@
 //! The program as a newcomer meets it: what it accepts, what it prints, and what it says when something is wrong.
 
 use std::io::{BufRead, BufReader, Write};
-use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 
 use ecod::model::names::NodeName;
@@ -554,9 +553,21 @@ fn a_node_without_camera_goes_on_as_the_program_without_opencv() {
     std::fs::create_dir_all(&bin).unwrap();
     std::fs::create_dir_all(&lib).unwrap();
     let (program, other) = (bin.join("ecod-node"), lib.join("ecod-node"));
-    std::fs::copy(env!("CARGO_BIN_EXE_ecod-node"), &program).unwrap();
-    std::fs::write(&other, "#!/bin/sh\necho \"without camera: $@\"\n").unwrap();
-    std::fs::set_permissions(&other, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let script = prefix.path().join("script");
+    std::fs::write(&script, "#!/bin/sh\necho \"without camera: $@\"\n").unwrap();
+    // Another process writes the programs. A child that another thread starts meanwhile would inherit a file that this
+    // process has open for writing, and Linux executes no such file.
+    for (from, to) in [
+        (
+            std::path::Path::new(env!("CARGO_BIN_EXE_ecod-node")),
+            &program,
+        ),
+        (&script, &other),
+    ] {
+        let mut install = Command::new("install");
+        install.args(["-m", "755"]).arg(from).arg(to);
+        assert!(install.status().unwrap().success());
+    }
     let run = |arguments: &[&str]| {
         Command::new(&program)
             .args(arguments)
