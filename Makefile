@@ -32,11 +32,13 @@ check: ## [check] format, clippy and unit tests of the core and of the node with
 	cargo test --locked --quiet -p ecod --lib
 	cargo test --locked --quiet -p ecod-actors --no-default-features --lib --bins
 
-words: ## [check] three habits that make texts hard to read, per area; the rates may only fall
+words: PACKAGES := python3
+words: setup ## [check] three habits that make texts hard to read, per area; the rates may only fall
 	packaging/check-words
 
 # make changelog VERSION=0.2.0 writes the section and removes the fragments.
-changelog: ## [release] join the fragments of changes/ into a section of CHANGELOG.md
+changelog: PACKAGES := python3
+changelog: setup ## [release] join the fragments of changes/ into a section of CHANGELOG.md
 	packaging/join-changes $(VERSION)
 
 setup: ## [start] install the system packages that are missing
