@@ -2,9 +2,12 @@
 //! that most followers cannot reach.
 //!
 //! The old leader publishes until it receives the new leader's beat. It yields right after a round,
-//! so that almost a whole period remains for the few packets of the handover. The new leader
-//! publishes the next round. If all of these packets are lost for a period, the old leader
-//! publishes that round too, and yields again after it.
+//! so that almost a whole period remains for the few packets of the handover. From the challenger's
+//! `Ready` on, the fuser is told to hold rounds: none ends early, because a round that directly
+//! follows the yielded one would be published by both leaders. The round in progress may have ended
+//! before that order arrived, so the leader yields after the second round. The new leader publishes
+//! the next round. If all of these packets are lost for a period, the old leader publishes that
+//! round too, and yields again after it.
 
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::{Handover, Leading};
@@ -40,6 +43,7 @@ impl Election {
             retry_at: now,
             started_at: now,
             ready_at: None,
+            rounds_held: false,
             yielded: false,
         });
         self.name_successors(now);
@@ -89,22 +93,23 @@ impl Election {
         }
     }
 
-    /// Processes a challenger's answer that it is ready to lead. From now on the leader yields to
-    /// the challenger right after its next round.
+    /// Processes a challenger's answer that it is ready to lead. From now on rounds are held, and
+    /// the leader yields to the challenger right after the second of them.
     pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
         if let State::Leading(leading) = &mut self.state
             && let Some(handover) = leading
                 .handover
                 .as_mut()
-                .filter(|handover| handover.to == *from)
+                .filter(|handover| handover.to == *from && handover.ready_at.is_none())
         {
-            handover.ready_at.get_or_insert(now);
+            handover.ready_at = Some(now);
+            self.effects.push(ElectionEffect::HoldRound);
         }
     }
 
     /// Records a round that this node published or accepted. A follower takes it as a sign of life
-    /// of the leader; a leader with a ready challenger yields now, because a round has just been
-    /// published.
+    /// of the leader. A leader with a ready challenger holds the next round; if this one was held
+    /// already, it yields now, because almost a whole period remains.
     pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         if epoch.term <= self.term_limit(Role::Auto, now) {
             self.learn_term(epoch.term);
@@ -121,9 +126,13 @@ impl Election {
                     .as_mut()
                     .filter(|handover| handover.ready_at.is_some())
                 {
-                    handover.yielded = true;
-                    handover.retry_at = now;
-                    self.drive_handover(now);
+                    if std::mem::replace(&mut handover.rounds_held, true) {
+                        handover.yielded = true;
+                        handover.retry_at = now;
+                        self.drive_handover(now);
+                    } else {
+                        self.effects.push(ElectionEffect::HoldRound);
+                    }
                 }
             }
             State::Following(_) | State::Seeking(_) => {}

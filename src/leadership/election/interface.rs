@@ -116,8 +116,8 @@ pub enum ElectionEffect {
         /// Time at which the first round is due.
         first: FirstRound,
     },
-    /// Let the current round last its full length. The next round belongs to the other node, unless
-    /// that node publishes no round for a whole period.
+    /// Let the current round last its full length: another node is about to lead. After the yield,
+    /// the next round belongs to that node, unless it publishes no round for a whole period.
     HoldRound,
     /// Stop publishing in this epoch.
     StopPublishing {

@@ -17,6 +17,8 @@ pub(super) struct Handover {
     pub(super) retry_at: Timestamp,
     pub(super) started_at: Timestamp,
     pub(super) ready_at: Option<Timestamp>,
+    /// True if a round was published since then: the fuser has received the order to hold rounds.
+    pub(super) rounds_held: bool,
     pub(super) yielded: bool,
 }
 

@@ -190,8 +190,7 @@ pub enum Effect {
         /// Time at which it is due.
         first: FirstRound,
     },
-    /// Let the current round last its whole length: another node is about to lead from the next one
-    /// on.
+    /// Let the current round last its whole length: another node is about to lead.
     HoldRound,
     /// Stop publishing in this epoch.
     StopPublishing {

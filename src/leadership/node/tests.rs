@@ -424,6 +424,21 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
 }
 
 #[test]
+fn rounds_are_held_for_a_whole_round_before_the_lead_is_yielded() {
+    // A round that ends early right after the yielded one would be published by both leaders.
+    let scene = leading_beside_a_ready_challenger(None, Some(broker(2)));
+    let yielded = scene.position_of(is_yield).unwrap();
+    let holds = scene.effects[..yielded]
+        .iter()
+        .filter(|effect| **effect == Effect::HoldRound);
+    assert_eq!(
+        holds.count(),
+        3,
+        "as the challenger is ready, after the round then in progress, and after the next one"
+    );
+}
+
+#[test]
 fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
     // An external broker that is down does not serve the challenger either.
     for external in [None, Some(broker(9))] {
