@@ -3,8 +3,8 @@
 //!
 //! ```text
 //!   houses ==================================================
-//!   pavement      o ->   <- o        o              [galileo <
-//!   parked       [ van ] [ van ] [ van ]
+//!   pavement      o ->   <- o        o
+//!   parked       [ van ] [ van ]     [galileo <
 //!   road     ( <- - - - - - - gauss - - - - - car - - - - )
 //!            ( - - - euclid - - - - - - - - - - - - - - -> )
 //!   pavement  mast (kepler)   o ->   [kiosk]   <- o
@@ -45,12 +45,11 @@ impl Default for Street {
         let mut bodies = vec![
             driving(8.0, [180.0, 90.0, 30.0]),
             driving(38.0, [40.0, 130.0, 230.0]),
-            car(Route::stands(9.8, 7.2, 180.0), [90.0, 150.0, 60.0]),
+            car(Route::stands(6.5, 4.9, 180.0), [90.0, 150.0, 60.0]),
             driving(22.0, [70.0, 60.0, 200.0]),
             parked(-7.0, [200.0, 200.0, 205.0]),
             parked(-1.0, [120.0, 110.0, 70.0]),
-            parked(5.0, [60.0, 60.0, 65.0]),
-            // Behind the vans.
+                // Behind the vans.
             person(
                 walk(&[[-5.0, 6.7], [5.5, 6.7], [5.5, 7.6], [-5.0, 7.6]], 4.0),
                 [160.0, 90.0, 140.0],
