@@ -36,7 +36,7 @@ const MAX_PEER_NATS: f64 = 2.5;
 const LATENT_NATS: f64 = -3.0;
 
 /// Rate at which an object that no vehicle detects any more leaves, per second, in addition to that of all.
-const UNSEEN_HZ: f64 = 0.25;
+const UNSEEN_HZ: f64 = 0.15;
 
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);

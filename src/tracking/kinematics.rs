@@ -76,7 +76,7 @@ impl KinematicState {
 
     /// Covariance of the position at `at`, both parts, m².
     pub(super) fn covariance_at(&self, at: Timestamp) -> Matrix2<f64> {
-        self.independent_at(self.seconds_to(at)) + isotropic(1.0 * self.common_m)
+        self.independent_at(self.seconds_to(at)) + isotropic(self.common_m)
     }
 
     /// Covariance of the velocity, (m/s)².
@@ -198,7 +198,7 @@ impl KinematicState {
         self.pp *= excess;
         self.pv *= excess;
         self.vv *= excess;
-        self.inflate_velocity_covariance(1.0 * self.class.manoeuvre_mps);
+        self.inflate_velocity_covariance(self.class.manoeuvre_mps);
     }
 
     /// Limits the speed to the maximum of the class.

@@ -34,7 +34,7 @@ const USABLE_M: f64 = 1.5;
 
 /// Rate at which the probability of a position error falls, in standard deviations: errors of associated detections have
 /// an exponential tail.
-const ERROR_RATE: f64 = 1.23;
+const ERROR_RATE: f64 = 1.6;
 
 /// Number of detections that confirm a track.
 pub(super) const CONFIRMED_HITS: u32 = 5;
