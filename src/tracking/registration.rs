@@ -105,7 +105,7 @@ impl Correspondence {
             velocity,
             variance: sample.variance * (1.0 + 1.0 / weight),
             common: common / weight,
-            of_object: (1.0 * track.state.class.common_m).powi(2),
+            of_object: 2.0 * track.state.class.common_m.powi(2),
         })
     }
 }
