@@ -29,7 +29,6 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
-pub use map_share::MAX_SOLE_OBJECTS;
 pub use report_doubt::ReportDoubt;
 
 use foreign_view::ForeignView;
