@@ -121,7 +121,7 @@ impl ElectionDriver {
             MembershipEvent::Expelled { name } => {
                 self.cell_time.forget(&name);
                 self.life_signs.forget(&name);
-                self.parts.fuser.send(FuserMessage::ForgetMap { of: name });
+                self.parts.fuser.send(FuserMessage::Expel { node: name });
                 return;
             }
             MembershipEvent::Down { name } => Input::MemberDown { name },
