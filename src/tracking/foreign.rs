@@ -14,7 +14,6 @@ use nalgebra::Vector2;
 use uuid::Uuid;
 
 use super::HandOvers;
-use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::existence::JUDGED_AFTER;
 use super::handles::{SensorId, TrackIndex};
@@ -78,15 +77,10 @@ pub(super) struct ForeignObject {
 impl ForeignObject {
     fn new(stated: &NeighbourObject, fused_at: Timestamp, config: &TracksConfig) -> Self {
         let NeighbourObject { cell, object, .. } = stated;
-        let mut track = Track::new(
-            object.id,
-            fused_at,
-            &measurement(object, config),
-            ObjectClass::of(&object.label, config),
-        );
+        let mut track = Track::new(object.id, fused_at, &measurement(object, config), config);
         track.inherit(object, fused_at);
         if let Some(velocity) = object.velocity_mps {
-            lend_velocity(&mut track.state, fused_at, velocity.into());
+            lend_velocity(&mut track.state, fused_at, velocity.into(), config);
         }
         Self {
             cell: cell.clone(),
@@ -106,8 +100,8 @@ impl ForeignObject {
     }
 
     /// The object with its errors at `at`, as a measurement.
-    fn measured_at(&self, at: Timestamp) -> Measurement {
-        let independent = self.track.state.covariance_at(at);
+    fn measured_at(&self, at: Timestamp, config: &TracksConfig) -> Measurement {
+        let independent = self.track.state.covariance_at(at, config.density());
         Measurement {
             position: self.track.state.position_at(at),
             independent,
@@ -117,7 +111,10 @@ impl ForeignObject {
 
     /// Squared distance from a track in standard deviations, if both can be one object at `at`.
     fn distance_from(&self, track: &Track, at: Timestamp, config: &TracksConfig) -> Option<f64> {
-        let innovation = track.state.innovation(at, &self.measured_at(at));
+        let innovation =
+            track
+                .state
+                .innovation(at, &self.measured_at(at, config), config.density());
         let velocity = self.track.state.velocity - track.state.velocity;
         let variance = (self.track.state.velocity_covariance() + track.state.velocity_covariance())
             .trace()
@@ -327,7 +324,10 @@ impl ForeignObjects {
     ) -> Option<&ForeignObject> {
         let candidates = self.objects.iter().filter(|object| object.same.is_none());
         let near = candidates.filter_map(|object| {
-            let innovation = object.track.state.innovation(at, measurement);
+            let innovation = object
+                .track
+                .state
+                .innovation(at, measurement, config.density());
             let is_near = innovation.offset.norm() <= config.gate_m
                 && innovation.distance_squared <= config.gate();
             let is_like = |detected| object.track.label_similarity(detected) > MIN_LABEL_SIMILARITY;
@@ -357,22 +357,22 @@ impl ForeignObject {
         measurement: &Measurement,
         config: &TracksConfig,
     ) -> Track {
-        let mut track = Track::new(
-            self.track.id,
-            at,
-            measurement,
-            ObjectClass::of(&self.stated.object.label, config),
-        );
+        let mut track = Track::new(self.track.id, at, measurement, config);
         track.inherit(&self.stated.object, at);
         if let Some(velocity) = self.stated.object.velocity_mps {
-            lend_velocity(&mut track.state, at, velocity.into());
+            lend_velocity(&mut track.state, at, velocity.into(), config);
         }
         track
     }
 }
 
-fn lend_velocity(state: &mut KinematicState, at: Timestamp, velocity: Vector2<f64>) {
+fn lend_velocity(
+    state: &mut KinematicState,
+    at: Timestamp,
+    velocity: Vector2<f64>,
+    config: &TracksConfig,
+) {
     let sigma_mps = VELOCITY_SIGMA_MPS.hypot(VELOCITY_SIGMA_SHARE * velocity.norm());
-    state.update_velocity(at, velocity, sigma_mps);
-    state.limit_speed();
+    state.update_velocity(at, velocity, sigma_mps, config.density());
+    state.limit_speed(config.max_speed_mps);
 }
