@@ -285,7 +285,6 @@ impl Cell {
                     fuser_runs: true,
                     rejects_reports: false,
                     contradicts: false,
-                    certificate_ends: false,
                 };
                 return Some(Input::PartsAnswered { sample });
             }

@@ -325,7 +325,6 @@ impl Node {
             fuser_runs: true,
             rejects_reports: false,
             contradicts: false,
-            certificate_ends: false,
         }
     }
 }

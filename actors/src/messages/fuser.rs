@@ -28,11 +28,10 @@ pub enum FuserMessage {
         /// Time of receipt.
         received_at: Timestamp,
     },
-    /// Do not continue from a map of this node, and remove what it alone has reported: its
-    /// certificate was revoked or has expired.
-    Expel {
-        /// The node.
-        node: NodeName,
+    /// Do not continue from a map of this aggregator, because it is not trusted any more.
+    ForgetMap {
+        /// The aggregator.
+        of: NodeName,
     },
     /// Show these objects of other cells, and take over their identities.
     TakeNeighbours {

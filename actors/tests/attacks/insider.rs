@@ -121,17 +121,7 @@ impl Insider {
         epoch: Option<Epoch>,
         body: Body,
     ) -> anyhow::Result<()> {
-        self.repeat_all(term, epoch, &[body]).await
-    }
-
-    /// The same with several messages.
-    pub(crate) async fn repeat_all(
-        &self,
-        term: u64,
-        epoch: Option<Epoch>,
-        bodies: &[Body],
-    ) -> anyhow::Result<()> {
-        for (seq, body) in (1..).zip(bodies.iter().cycle()) {
+        for seq in 1.. {
             // It seems to be fit where it claims to lead.
             let fit = matches!(body, Body::Beat { .. });
             let message = ElectionMessage {
@@ -166,9 +156,7 @@ impl Insider {
                 })?;
                 self.target.did(1);
             }
-            if seq % bodies.len() as u64 == 0 {
-                sleep(Duration::from_millis(100)).await;
-            }
+            sleep(Duration::from_millis(100)).await;
         }
         Ok(())
     }

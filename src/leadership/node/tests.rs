@@ -105,7 +105,6 @@ impl Scene {
                         fuser_runs: true,
                         rejects_reports: false,
                         contradicts: false,
-                        certificate_ends: false,
                     },
                 },
                 effect => {
