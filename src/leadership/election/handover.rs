@@ -3,7 +3,7 @@
 //!
 //! The old leader publishes until it receives the new leader's beat. It yields right after a round,
 //! so that almost a whole period remains for the few packets of the handover. From the challenger's
-//! `Ready` on, the fuser is told to hold rounds: none ends early, because a round that directly
+//! `Ready` on, the fuser holds rounds: each ends at its time, because a round that directly
 //! follows the yielded one would be published by both leaders. The round in progress may have ended
 //! before that order arrived, so the leader yields after the second round. The new leader publishes
 //! the next round. If all of these packets are lost for a period, the old leader publishes that
