@@ -139,8 +139,10 @@ async fn on_a_thread(
 ) -> anyhow::Result<Sent> {
     let (done, sent) = oneshot::channel();
     let drive = move || {
-        done.send(drive(schedule, load, &target, senders))
-            .unwrap_or_default();
+        let sent = drive(schedule, load, &target, senders);
+        if done.send(sent).is_err() {
+            tracing::debug!("the measurement ended before its sending thread");
+        }
     };
     thread::Builder::new()
         .name("bench-driver".into())
