@@ -42,8 +42,8 @@ impl Election {
             to: to.clone(),
             retry_at: now,
             started_at: now,
-            ready_at: None,
-            rounds_held: false,
+            round_awaited_since: None,
+            is_round_held: false,
             yielded: false,
         });
         self.name_successors(now);
@@ -81,14 +81,14 @@ impl Election {
         }
         // A cell that publishes no rounds cannot miss one.
         handover.yielded |= handover
-            .ready_at
+            .round_awaited_since
             .is_some_and(|at| now.since(at) > self.config.roundless_yield());
         handover.retry_at = now + self.config.handover_retry(handover.yielded);
         let last_round = self.round;
         if handover.yielded {
             self.effects.push(ElectionEffect::HoldRound);
             self.send(&to, Body::Yield { last_round }, now);
-        } else if handover.ready_at.is_none() {
+        } else if handover.round_awaited_since.is_none() {
             self.send(&to, Body::Offer, now);
         }
     }
@@ -100,9 +100,9 @@ impl Election {
             && let Some(handover) = leading
                 .handover
                 .as_mut()
-                .filter(|handover| handover.to == *from && handover.ready_at.is_none())
+                .filter(|handover| handover.to == *from && handover.round_awaited_since.is_none())
         {
-            handover.ready_at = Some(now);
+            handover.round_awaited_since = Some(now);
             self.effects.push(ElectionEffect::HoldRound);
         }
     }
@@ -124,9 +124,10 @@ impl Election {
                 if let Some(handover) = leading
                     .handover
                     .as_mut()
-                    .filter(|handover| handover.ready_at.is_some())
+                    .filter(|handover| handover.round_awaited_since.is_some())
                 {
-                    if std::mem::replace(&mut handover.rounds_held, true) {
+                    handover.round_awaited_since = Some(now);
+                    if std::mem::replace(&mut handover.is_round_held, true) {
                         handover.yielded = true;
                         handover.retry_at = now;
                         self.drive_handover(now);

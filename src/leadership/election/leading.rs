@@ -16,9 +16,11 @@ pub(super) struct Handover {
     pub(super) to: NodeName,
     pub(super) retry_at: Timestamp,
     pub(super) started_at: Timestamp,
-    pub(super) ready_at: Option<Timestamp>,
-    /// True if a round was published since then: the fuser has received the order to hold rounds.
-    pub(super) rounds_held: bool,
+    /// Start of the wait for the next round; `None` until the challenger is ready.
+    pub(super) round_awaited_since: Option<Timestamp>,
+    /// True if a round has ended since the challenger became ready, so that the next one is held
+    /// from its start.
+    pub(super) is_round_held: bool,
     pub(super) yielded: bool,
 }
 

@@ -183,6 +183,27 @@ impl Scene {
         notice.collect()
     }
 
+    /// Millisecond `ms` beside a candidate that is ready; rounds end every `round_ms`.
+    fn hear_ready_challenger(&mut self, epoch: &Epoch, ms: u64, round_ms: u64) {
+        if ms.is_multiple_of(50) {
+            self.hear_in(
+                epoch.clone(),
+                Body::Status {
+                    over: None,
+                    no_login: Vec::new(),
+                },
+            );
+            self.hear_in(epoch.clone(), Body::Ready);
+        }
+        if ms.is_multiple_of(round_ms) {
+            self.take(Input::RoundAccepted {
+                epoch: epoch.clone(),
+                round: ms / round_ms,
+            });
+        }
+        self.run_for(1);
+    }
+
     fn position_of(&self, wanted: impl Fn(&Effect) -> bool) -> Option<usize> {
         self.effects.iter().position(wanted)
     }
@@ -362,17 +383,7 @@ fn leading_beside_a_ready_challenger(
 
 /// The same, where the broker has the certificate of `shown`.
 fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, shown: &str) -> Scene {
-    let mut scene = Scene::new(Role::Auto, None);
-    scene.machine.links = Links::new(DataPlane {
-        external: external.map(Into::into),
-        embedded: true,
-    });
-    scene.take(Input::MemberAlive {
-        member: member("edge", 2),
-    });
-    scene.members.push(member("edge", 2));
-    scene.run_for(1300);
-    assert!(scene.machine.leadership.is_leading());
+    let mut scene = leading_with_external_broker(external);
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
     for ms in 0..4500 {
         if let Some(broker) = broker.filter(|_| ms == 1000) {
@@ -387,24 +398,24 @@ fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, show
                 state: LinkState::Up,
             });
         }
-        if ms % 50 == 0 {
-            scene.hear_in(
-                epoch.clone(),
-                Body::Status {
-                    over: None,
-                    no_login: Vec::new(),
-                },
-            );
-            scene.hear_in(epoch.clone(), Body::Ready);
-        }
-        if ms % 100 == 0 {
-            scene.take(Input::RoundAccepted {
-                epoch: epoch.clone(),
-                round: ms / 100,
-            });
-        }
-        scene.run_for(1);
+        scene.hear_ready_challenger(&epoch, ms, 100);
     }
+    scene
+}
+
+/// A leader that has just found a better candidate.
+fn leading_with_external_broker(external: Option<SocketAddr>) -> Scene {
+    let mut scene = Scene::new(Role::Auto, None);
+    scene.machine.links = Links::new(DataPlane {
+        external: external.map(Into::into),
+        embedded: true,
+    });
+    scene.take(Input::MemberAlive {
+        member: member("edge", 2),
+    });
+    scene.members.push(member("edge", 2));
+    scene.run_for(1300);
+    assert!(scene.machine.leadership.is_leading());
     scene
 }
 
@@ -435,6 +446,30 @@ fn rounds_are_held_for_a_whole_round_before_the_lead_is_yielded() {
         holds.count(),
         3,
         "as the challenger is ready, after the round then in progress, and after the next one"
+    );
+}
+
+#[test]
+fn the_lead_is_yielded_right_after_a_round_also_if_rounds_are_slow() {
+    const ROUND_MS: u64 = 700;
+    let mut scene = leading_with_external_broker(None);
+    let epoch = scene.machine.leadership.epoch.clone().unwrap();
+    scene.take(Input::BrokerProven {
+        broker: broker(2).into(),
+        node: name("edge"),
+    });
+    scene.take(Input::LinkChanged {
+        broker: broker(2).into(),
+        state: LinkState::Up,
+    });
+    let yielded_ms = (0..6000).find(|ms| {
+        scene.hear_ready_challenger(&epoch, *ms, ROUND_MS);
+        scene.position_of(is_yield).is_some()
+    });
+    assert_eq!(
+        yielded_ms.map(|ms| ms % ROUND_MS),
+        Some(0),
+        "yielded at {yielded_ms:?} ms, which is within a round"
     );
 }
 
