@@ -16,6 +16,7 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
+mod expelled;
 mod foreign_view;
 mod map_share;
 mod neighbouring;
@@ -29,9 +30,9 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
-pub use map_share::MAX_SOLE_OBJECTS;
 pub use report_doubt::ReportDoubt;
 
+use expelled::Expelled;
 use foreign_view::ForeignView;
 use map_share::limit_shares;
 use nalgebra::Point2;
@@ -103,6 +104,7 @@ pub struct Aggregator {
     /// first.
     overtaken: u64,
     placements: Placements,
+    expelled: Expelled,
     neighbours: NeighbourView,
     foreign: ForeignView,
     /// Weight of the initial score in published reputations, in votes.
@@ -148,6 +150,7 @@ impl Aggregator {
             tracks_open_cell,
             overtaken: 0,
             placements: Placements::default(),
+            expelled: Expelled::default(),
             neighbours: NeighbourView::default(),
             foreign: ForeignView::default(),
             initial_votes,
@@ -457,6 +460,12 @@ impl Aggregator {
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }
 
+    /// Removes what a vehicle alone has reported so far, because its certificate was revoked or has
+    /// expired.
+    pub fn expel(&mut self, vehicle: NodeName, now: Timestamp) {
+        self.expelled.add(vehicle, now);
+    }
+
     /// Sets the cell's time minus the time given as `now`, in microseconds; initially 0. Reports
     /// and rounds are dated in the cell's time, which may jump; everything else uses `now`, which
     /// does not.
@@ -569,6 +578,7 @@ impl Aggregator {
             oldest_capture,
             evidence: seen,
         } = tracks;
+        self.expelled.remove_objects(&mut objects, now);
         let mut left_out = limit_shares(&mut objects);
         date_objects(&mut objects, self.cell_offset_us);
         let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| {

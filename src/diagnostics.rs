@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::model::names::{MAX_NAME_BYTES, plain_text};
+use crate::model::names::{MAX_NAME_BYTES, plain_text, vehicle_of};
 use crate::model::time::Timestamp;
 use crate::wire::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 
@@ -185,8 +185,8 @@ const NEW_CAUSE_INTERVAL: Duration = Duration::from_secs(60);
 /// message may produce.
 const TEXT_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Maximum number of stored troubles: about one vehicle or host, of kinds that outside hosts can
-/// cause, and about all nodes other than this one.
+/// Maximum number of stored troubles: about one vehicle with its parts or one host, of kinds that
+/// outside hosts can cause, and about all nodes other than this one.
 const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
@@ -339,7 +339,9 @@ impl TroubleRegister {
         if about.is_none() {
             return true;
         }
-        self.make_room_in(MAX_ABOUT_ONE, now, |(other, _)| other == about)
+        let vehicle = about.as_deref().map(vehicle_of);
+        let is_of_vehicle = |(other, _): &Key| other.as_deref().map(vehicle_of) == vehicle;
+        self.make_room_in(MAX_ABOUT_ONE, now, is_of_vehicle)
             && (!kind.is_of_strangers()
                 || self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers()))
             && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
@@ -517,6 +519,22 @@ mod tests {
             shown(&register, at(60)),
             [": no frame", "late: x"],
             "lapsed ones give way"
+        );
+    }
+
+    #[test]
+    fn the_parts_of_one_vehicle_leave_room_for_others() {
+        let mut register = TroubleRegister::default();
+        for part in 0..100 {
+            for kind in [TroubleKind::Malformed, TroubleKind::Misplaced] {
+                register.note(kind, Some(&format!("mallory--{part}")), "x", at(0));
+            }
+        }
+        assert_eq!(register.present(at(0)).len(), MAX_ABOUT_ONE + 1);
+        assert!(
+            register
+                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .is_some()
         );
     }
 

@@ -285,6 +285,7 @@ impl Cell {
                     fuser_runs: true,
                     rejects_reports: false,
                     contradicts: false,
+                    certificate_ends: false,
                 };
                 return Some(Input::PartsAnswered { sample });
             }

@@ -1,5 +1,6 @@
 //! VOTE as a driver sees it.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use ecod::model::names::NodeName;
@@ -424,6 +425,46 @@ fn two_against_one_stay_right_when_votes_become_evidence_whoever_reports_first()
                 );
             }
         }
+    }
+}
+
+/// One vehicle reports the truth while it is alone, and another label everywhere as soon as others come, one every ten
+/// seconds. All places, or nearly all, have one label, so that agreement beyond chance tells nothing.
+#[test]
+fn who_was_there_first_does_not_outvote_several_that_come_later() {
+    for rare in [0, 1, 3] {
+        let truth = |place: usize| if place < rare { "van" } else { "car" };
+        let names: Vec<String> = (0..12).map(|place| format!("slot-{place}")).collect();
+        let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+        let (mut wrong, mut refuted) = ([0; 8], BTreeMap::<NodeName, i64>::new());
+        for frame in 0..1100 {
+            let at = START + Duration::from_millis(100 * frame);
+            let honest = (frame.saturating_sub(200) / 100).min(7) as usize;
+            let mut say = |node: &str, label: &dyn Fn(usize) -> &'static str| {
+                let votes: Vec<_> = (0..12).map(|at| (&*names[at], label(at), 0.9)).collect();
+                vote.observe(&report(node, frame, at, &votes), at).unwrap();
+            };
+            say("first", &|place| {
+                if frame < 200 { truth(place) } else { "bus" }
+            });
+            for vehicle in 0..honest {
+                say(&format!("v{vehicle}"), &truth);
+            }
+            let round = vote.close(at);
+            for evidence in round.evidence {
+                *refuted.entry(evidence.node).or_default() += if evidence.correct { -1 } else { 1 };
+            }
+            for verdict in round.verdicts {
+                let place: usize = verdict.landmark["slot-".len()..].parse().unwrap();
+                wrong[honest] += u32::from(verdict.label.as_deref() != Some(truth(place)));
+            }
+        }
+        assert_eq!(wrong[3..], [0; 5], "{rare} rare: {wrong:?}");
+        // Two need some seconds, of ten.
+        assert!(wrong[2] < 600, "{rare} rare: {wrong:?}");
+        let is_refuted =
+            |(node, votes): (&NodeName, &i64)| (node.as_str() == "first") == (*votes > 0);
+        assert!(refuted.iter().all(is_refuted), "{rare} rare: {refuted:?}");
     }
 }
 

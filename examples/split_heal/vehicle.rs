@@ -332,6 +332,7 @@ impl Vehicle {
                     fuser_runs: true,
                     rejects_reports: false,
                     contradicts: false,
+                    certificate_ends: false,
                 };
                 return Some(Input::PartsAnswered { sample });
             }

@@ -108,7 +108,8 @@ impl RosOptions {
             ..RosCamera::default()
         };
         if let Some(file) = &self.projection {
-            let text = std::fs::read_to_string(file)
+            let text = regular(file)
+                .and_then(std::fs::read_to_string)
                 .map_err(|error| format!("{}: {error}", file.display()))?;
             camera.projection =
                 toml::from_str(&text).map_err(|error| format!("{}: {error}", file.display()))?;
@@ -247,6 +248,16 @@ fn main() -> ExitCode {
     }
 }
 
+/// The path of a regular file: a pipe or a device might not end.
+#[cfg(feature = "ros2")]
+fn regular(path: &std::path::Path) -> std::io::Result<&std::path::Path> {
+    if std::fs::metadata(path)?.is_file() {
+        Ok(path)
+    } else {
+        Err(std::io::Error::other("it is not a regular file"))
+    }
+}
+
 #[cfg(feature = "ros2")]
 fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String> {
     let logs = logs(log)?;
@@ -256,7 +267,9 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
         let mut converted = RosLog::new(file).map_err(|error| at_output(&error))?;
         for log in &logs {
             let at_log = |error: &dyn Display| format!("{}: {error}", log.display());
-            let file = std::fs::File::open(log).map_err(|error| at_log(&error))?;
+            let file = regular(log)
+                .and_then(std::fs::File::open)
+                .map_err(|error| at_log(&error))?;
             converted
                 .add(std::io::BufReader::new(file))
                 .map_err(|error| at_log(&error))?;
@@ -308,5 +321,21 @@ fn logs(path: &std::path::Path) -> Result<Vec<PathBuf>, String> {
         Err(format!("{}: there is no .mcap file", path.display()))
     } else {
         Ok(logs)
+    }
+}
+
+#[cfg(all(test, feature = "ros2"))]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn a_device_is_not_converted() {
+        let directory = tempfile::tempdir().unwrap();
+        let output = directory.path().join("ros2.mcap");
+        let error = convert(Path::new("/dev/zero"), &output).unwrap_err();
+        assert!(error.contains("not a regular file"), "{error}");
+        assert!(!output.exists());
     }
 }

@@ -76,6 +76,11 @@ pub enum Command {
         #[schemars(with = "serde_json::Value")]
         landmarks: Vec<LandmarkConfig>,
     },
+    /// [`Aggregator::expel`].
+    Expel {
+        /// The vehicle.
+        vehicle: NodeName,
+    },
     /// [`Aggregator::set_cell_offset`].
     SetCellOffset {
         /// The cell's time minus the aggregator's clock in microseconds.
@@ -108,6 +113,7 @@ impl Aggregator {
                     landmarks.iter().map(Landmark::from).collect(),
                 );
             }
+            Command::Expel { vehicle } => self.expel(vehicle.clone(), now),
             Command::SetCellOffset { offset_us } => self.set_cell_offset(*offset_us),
         }
         None

@@ -6,62 +6,52 @@ use std::collections::BTreeMap;
 use crate::model::names::NodeName;
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
-/// Maximum number of objects in a map that only one vehicle has reported, including its parts: as
-/// many as one report may have. Without this bound, one member's reports could make the map too
-/// large for the links to carry once per round.
-pub const MAX_SOLE_OBJECTS: usize = 1024;
+/// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
+/// parts: 1024 objects with short labels, as many as one report may have. Without this bound, one
+/// member's reports could make the map too large for the links to carry once per round.
+const MAX_SOLE_BYTES: usize = 1024 * (NUMBERS_BYTES + 32);
 
-/// Removes the objects beyond each vehicle's share, the least certain first, and returns the
-/// removed entries.
+/// Size in JSON of an object without its texts.
+const NUMBERS_BYTES: usize = 352;
+
+/// Size in JSON of one score without its label.
+const SCORE_BYTES: usize = 25;
+
+/// Removes the objects beyond each vehicle's share, the least certain first and of equally certain
+/// ones the last, and returns the removed entries.
 pub(super) fn limit_shares(objects: &mut Vec<FusedObject>) -> Vec<InvalidEntry> {
-    if objects.len() <= MAX_SOLE_OBJECTS {
-        return Vec::new();
-    }
-    let mut confidences: BTreeMap<NodeName, Vec<f64>> = BTreeMap::new();
-    for object in &*objects {
+    let mut sole: BTreeMap<&NodeName, Vec<usize>> = BTreeMap::new();
+    for (place, object) in objects.iter().enumerate() {
         if let [vehicle] = &object.contributors[..] {
-            confidences
-                .entry(vehicle.clone())
-                .or_default()
-                .push(object.confidence);
+            sole.entry(vehicle).or_default().push(place);
         }
     }
-    // The confidence that objects of a vehicle must exceed, and the number of objects with exactly
-    // this confidence that are kept.
-    let mut bounds: BTreeMap<NodeName, (f64, usize)> = BTreeMap::new();
-    for (vehicle, mut of_vehicle) in confidences {
-        if of_vehicle.len() > MAX_SOLE_OBJECTS {
-            of_vehicle.sort_by(|a, b| b.total_cmp(a));
-            let bound = of_vehicle[MAX_SOLE_OBJECTS - 1];
-            let above = of_vehicle
-                .iter()
-                .filter(|confidence| **confidence > bound)
-                .count();
-            bounds.insert(vehicle, (bound, MAX_SOLE_OBJECTS - above));
+    let mut is_kept = vec![true; objects.len()];
+    for places in sole.values_mut() {
+        let confidence = |place: usize| objects[place].confidence;
+        places.sort_by(|one, other| confidence(*other).total_cmp(&confidence(*one)));
+        let mut bytes = 0;
+        for place in places {
+            bytes += bytes_of(&objects[*place]);
+            is_kept[*place] = bytes <= MAX_SOLE_BYTES;
         }
     }
-    let mut removed = Vec::new();
-    objects.retain(|object| {
-        let [vehicle] = &object.contributors[..] else {
-            return true;
-        };
-        let Some((bound, room)) = bounds.get_mut(vehicle) else {
-            return true;
-        };
-        if object.confidence > *bound {
-            return true;
-        }
-        if object.confidence == *bound && *room > 0 {
-            *room -= 1;
-            return true;
-        }
-        removed.push(InvalidEntry {
-            reason: RejectReason::TooManyObjects,
-            contributors: vec![vehicle.clone()],
-        });
-        false
-    });
+    let mut is_kept = is_kept.into_iter();
+    let removed = objects.extract_if(.., |_| is_kept.next() == Some(false));
     removed
+        .map(|object| InvalidEntry {
+            reason: RejectReason::TooManyObjects,
+            contributors: object.contributors,
+        })
+        .collect()
+}
+
+/// About the size of an object in JSON.
+fn bytes_of(object: &FusedObject) -> usize {
+    let scores = object.scores.keys().map(|label| label.len() + SCORE_BYTES);
+    let names = object.contributors.iter().chain(&object.vehicle);
+    let names = names.map(|name| name.as_str().len());
+    NUMBERS_BYTES + object.label.len() + scores.sum::<usize>() + names.sum::<usize>()
 }
 
 #[cfg(test)]
@@ -70,6 +60,10 @@ mod tests {
 
     use super::*;
     use crate::model::geometry::Covariance;
+    use crate::model::time::Timestamp;
+
+    /// Number of objects of the tests in a share.
+    const KEPT: usize = MAX_SOLE_BYTES / (NUMBERS_BYTES + "car".len() + "mallory".len());
 
     fn object(number: usize, confidence: f64, contributors: &[&'static str]) -> FusedObject {
         let covariance = Covariance::isotropic(0.3);
@@ -98,7 +92,7 @@ mod tests {
         let shared = (5100..9000).map(|number| object(number, 0.01, &["euclid", "mallory"]));
         let mut objects: Vec<_> = invented.chain(honest).chain(shared).collect();
         let removed = limit_shares(&mut objects);
-        assert_eq!(removed.len(), 5000 - MAX_SOLE_OBJECTS);
+        assert_eq!(removed.len(), 5000 - KEPT);
         assert!(
             removed
                 .iter()
@@ -120,7 +114,7 @@ mod tests {
                 of(&["euclid"]),
                 of(&["euclid", "mallory"])
             ],
-            [MAX_SOLE_OBJECTS, 100, 3900]
+            [KEPT, 100, 3900]
         );
         let least_certain = objects
             .iter()
@@ -140,7 +134,36 @@ mod tests {
         let mut objects: Vec<_> = (0..2000)
             .map(|number| object(number, 0.5, &["mallory"]))
             .collect();
-        assert_eq!(limit_shares(&mut objects).len(), 2000 - MAX_SOLE_OBJECTS);
-        assert_eq!(objects.last().unwrap().x_m, (MAX_SOLE_OBJECTS - 1) as f64);
+        assert_eq!(limit_shares(&mut objects).len(), 2000 - KEPT);
+        assert_eq!(objects.last().unwrap().x_m, (KEPT - 1) as f64);
+    }
+
+    #[test]
+    fn long_texts_take_the_place_of_objects_and_the_estimate_is_close() {
+        let long = "x".repeat(64);
+        let wordy = |number| FusedObject {
+            label: long.clone().into(),
+            scores: (0..8)
+                .map(|class| (format!("{class}{long}").into(), 0.123_456_789))
+                .collect(),
+            covariance_m2: [0.123_456_789_012; 3],
+            existence: Some(0.123_456_789_012),
+            velocity_mps: Some([12.345_678_901_234; 2]),
+            heading_rad: Some(1.234_567_890_123),
+            size_m: Some([4.567_890_123_456; 2]),
+            age_s: Some(0.123_456_789_012),
+            first_seen_us: Some(Timestamp(1_795_000_000_000_000)),
+            ..object(number, 0.5, &["mallory"])
+        };
+        let mut objects: Vec<_> = (0..1024).map(wordy).collect();
+        assert!(!limit_shares(&mut objects).is_empty());
+        let json = objects
+            .iter()
+            .map(|object| serde_json::to_vec(object).unwrap().len());
+        let bytes: usize = json.sum();
+        assert!(
+            (MAX_SOLE_BYTES * 3 / 4..MAX_SOLE_BYTES * 5 / 4).contains(&bytes),
+            "{bytes}"
+        );
     }
 }

@@ -3,11 +3,14 @@ mod configure;
 mod foreign;
 mod one_answer;
 
+use std::collections::BTreeSet;
+
 use ReportKind::{Detections, VoteDetections};
 use nalgebra::Point2;
 
 use super::*;
 use crate::aggregator::round::{RoundClose, RoundConfig};
+use crate::tracking::TracksConfig;
 use crate::vote::VoteConfig;
 use crate::wire::PerceivedObject;
 
@@ -54,6 +57,74 @@ fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
             .as_ref()
             .and_then(|verdicts| verdicts.verdicts[0].label.as_deref()),
     )
+}
+
+#[test]
+fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
+    let tracks = TracksConfig {
+        mode: TracksMode::On,
+        ..TracksConfig::default()
+    };
+    let round = RoundConfig {
+        close: RoundClose::Periodic,
+        ..RoundConfig::default()
+    };
+    let mut cell = leader(FusionConfig {
+        tracks,
+        round,
+        ..FusionConfig::default()
+    });
+    let (mallory, euclid) = (
+        NodeName::from_static("mallory"),
+        NodeName::from_static("euclid"),
+    );
+    let reporters = |cell: &mut Aggregator, rounds: std::ops::Range<u64>| {
+        let mut last = BTreeSet::new();
+        for round in rounds {
+            let now = at(round * 100);
+            // The vehicle is silent for a second when its certificate is revoked.
+            let silent = (21..31).contains(&round);
+            for (node, y_m) in [(&mallory, 30.0), (&euclid, -30.0)] {
+                if silent && *node == mallory {
+                    continue;
+                }
+                let report = ObjectReport {
+                    objects: vec![PerceivedObject::new("car", 0.9, 20.0, y_m)],
+                    ..ObjectReport::new(node.clone(), round, at(round * 100 - 20))
+                };
+                cell.report(
+                    Detections,
+                    &Arc::new(report),
+                    now - Duration::from_millis(10),
+                )
+                .unwrap();
+            }
+            let map = cell.tick(now).unwrap().map.unwrap();
+            last = map
+                .objects
+                .into_iter()
+                .flat_map(|object| object.contributors)
+                .collect();
+        }
+        last
+    };
+    let both = BTreeSet::from([mallory.clone(), euclid.clone()]);
+    assert_eq!(reporters(&mut cell, 1..21), both);
+    assert_eq!(
+        reporters(&mut cell, 21..22),
+        both,
+        "it outlives a detection"
+    );
+    cell.expel(mallory.clone(), at(2150));
+    assert_eq!(
+        reporters(&mut cell, 22..31),
+        BTreeSet::from([euclid.clone()])
+    );
+    assert_eq!(
+        reporters(&mut cell, 31..41),
+        both,
+        "it has a new certificate"
+    );
 }
 
 #[test]

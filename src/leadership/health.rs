@@ -44,6 +44,8 @@ pub struct HealthSample {
     /// True if the node does not use the cell's description because its own configuration
     /// contradicts it.
     pub contradicts: bool,
+    /// True if the node's certificate ends soon: other nodes then end their connections to it.
+    pub certificate_ends: bool,
 }
 
 impl HealthMonitor {
@@ -146,8 +148,8 @@ impl HealthMonitor {
     /// Health of the parts, for the election. A node needs the external broker or its own broker,
     /// depending on which of them it uses; if it uses both, one is enough. A stalled link does not
     /// count as a link, rejected reports do not count as usable, and own settings that contradict
-    /// the cell's do not count as valid. A leader with `no_other` candidate ignores all of this,
-    /// because stepping down would leave the cell without a leader.
+    /// the cell's, or a certificate that ends soon, do not count as valid. A leader with `no_other`
+    /// candidate ignores all of this, because stepping down would leave the cell without a leader.
     pub fn health(
         &self,
         plane: &DataPlane,
@@ -167,7 +169,7 @@ impl HealthMonitor {
             gateway: self.sample.links.is_some()
                 && (external || (embedded && self.is_up(brokers.own.as_ref(), no_other))),
             reports: no_other || !self.sample.rejects_reports,
-            settings: no_other || !self.sample.contradicts,
+            settings: no_other || !(self.sample.contradicts || self.sample.certificate_ends),
             load_percent: self.load_percent,
         }
     }
@@ -218,6 +220,7 @@ mod tests {
             fuser_runs: true,
             rejects_reports: false,
             contradicts: false,
+            certificate_ends: false,
         }
     }
 
@@ -298,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_with_unusable_reports_or_settings_of_its_own_makes_way_if_another_could_lead() {
+    fn a_leader_with_unusable_reports_settings_or_certificate_makes_way_if_another_could_lead() {
         let (plane, brokers) = (
             DataPlane {
                 external: None,
@@ -309,12 +312,13 @@ mod tests {
                 ..Brokers::default()
             },
         );
-        for (rejects_reports, contradicts) in [(true, false), (false, true)] {
+        for fault in 0..3 {
             let mut monitor = monitor(Timestamp(60_000_000));
             let links = Some(BTreeMap::from([(address(1), LinkState::Up)]));
             monitor.note_sample(HealthSample {
-                rejects_reports,
-                contradicts,
+                rejects_reports: fault == 0,
+                contradicts: fault == 1,
+                certificate_ends: fault == 2,
                 ..sample(links)
             });
             assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());

@@ -63,10 +63,20 @@ impl NodeName {
     /// name itself.
     #[must_use]
     pub fn vehicle(&self) -> Self {
-        match self.0.split_once(PART_MARK) {
-            Some((vehicle, _)) if !vehicle.is_empty() => Self(SmolStr::new(vehicle)),
-            _ => self.clone(),
+        let vehicle = vehicle_of(&self.0);
+        if vehicle.len() == self.0.len() {
+            self.clone()
+        } else {
+            Self(SmolStr::new(vehicle))
         }
+    }
+}
+
+/// As [`NodeName::vehicle`], for a text that may be another kind of name, such as an address.
+pub fn vehicle_of(name: &str) -> &str {
+    match name.split_once(PART_MARK) {
+        Some((vehicle, _)) if !vehicle.is_empty() => vehicle,
+        _ => name,
     }
 }
 

@@ -325,6 +325,7 @@ impl Node {
             fuser_runs: true,
             rejects_reports: false,
             contradicts: false,
+            certificate_ends: false,
         }
     }
 }

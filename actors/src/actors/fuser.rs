@@ -124,7 +124,7 @@ impl Actor for Fuser {
         match message {
             FuserMessage::TakeReports => state.take_reports(),
             FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
-            FuserMessage::ForgetMap { of } => state.forget_map(&of),
+            FuserMessage::Expel { node } => state.expel(node),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
@@ -381,14 +381,14 @@ impl FuserState {
         match self.aggregator.knows_location(id) {
             Some(true) => {}
             Some(false) => {
-                let cause = format!("names the location {id}, which this node does not know");
+                let cause = format!("names the location “{id}”, which this node does not know");
                 troubles.note_about(node, TroubleKind::UnknownLocation, &cause);
             }
             // Votes name locations themselves where no list is configured.
             None if kind == ReportKind::VoteDetections => {}
             None => {
                 let cause =
-                    format!("{node} names known locations, such as {id}, and this node has none");
+                    format!("{node} names known locations, such as “{id}”, and this node has none");
                 troubles.note(TroubleKind::NoLocations, &cause);
             }
         }
@@ -401,11 +401,12 @@ impl FuserState {
         }
     }
 
-    fn forget_map(&mut self, aggregator: &NodeName) {
+    fn expel(&mut self, node: NodeName) {
         self.last_map = self
             .last_map
             .take()
-            .filter(|(map, _)| map.aggregator != *aggregator);
+            .filter(|(map, _)| map.aggregator != node);
+        self.command(Command::Expel { vehicle: node });
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {

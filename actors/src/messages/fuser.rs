@@ -28,10 +28,11 @@ pub enum FuserMessage {
         /// Time of receipt.
         received_at: Timestamp,
     },
-    /// Do not continue from a map of this aggregator, because it is not trusted any more.
-    ForgetMap {
-        /// The aggregator.
-        of: NodeName,
+    /// Do not continue from a map of this node, and remove what it alone has reported: its
+    /// certificate was revoked or has expired.
+    Expel {
+        /// The node.
+        node: NodeName,
     },
     /// Show these objects of other cells, and take over their identities.
     TakeNeighbours {

@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 
 use ecod::model::names::NodeName;
 use ring::digest::{SHA256, digest};
+use rustix::fs::OFlags;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -53,6 +54,8 @@ impl StateFile {
             .write(true)
             .create(true)
             .truncate(false)
+            // Opening a pipe would wait for a reader.
+            .custom_flags(OFlags::NONBLOCK.bits() as i32)
             .open(directory.join(format!("{cell}.{node}.lock")))?;
         file.try_lock()?;
         Ok(file)
@@ -257,6 +260,28 @@ mod tests {
             assert_eq!(file.load::<u64>(|_| true), None);
             assert!(!file.path().exists(), "set aside");
         }
+    }
+
+    #[test]
+    fn pipes_among_the_files_delay_no_start() {
+        let directory = tempfile::tempdir().unwrap();
+        let [cell, node] = ["lot-1", "edge"].map(NodeName::from_static);
+        let file = file(directory.path());
+        let lock = directory.path().join("lot-1.edge.lock");
+        for path in [file.path(), &lock] {
+            rustix::fs::mknodat(
+                rustix::fs::CWD,
+                path,
+                rustix::fs::FileType::Fifo,
+                rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR,
+                0,
+            )
+            .unwrap();
+        }
+        assert!(StateFile::lock(directory.path(), &cell, &node).is_err());
+        assert_eq!(file.load::<Vec<u32>>(|_| true), None);
+        file.save(&[1]).unwrap();
+        assert_eq!(file.load(|_| true), Some(vec![1]));
     }
 
     #[test]

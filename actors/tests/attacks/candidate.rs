@@ -10,6 +10,8 @@ use ecod::wire::{Encoding, GlobalMap, MAX_INTEGER, Role, encode};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::EvidenceSigner;
 use futures_util::future::join_all;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use tokio::io::AsyncWriteExt;
 use tokio::time::sleep;
 
@@ -17,7 +19,7 @@ use crate::cell::{CANDIDATE, CELL, LEADER, Target};
 use crate::client::{log_in, publish, send_for_ever};
 use crate::description::set_without_right;
 use crate::insider::Insider;
-use crate::row::{Means, Row, UNHARMED};
+use crate::row::{Bar, Means, Row, UNHARMED};
 use crate::shares::inverted;
 
 pub(crate) const ROWS: &[Row] = &[
@@ -56,6 +58,19 @@ pub(crate) const ROWS: &[Row] = &[
         bar: UNHARMED,
         quick: false,
         run: |target| Box::pin(beats(target, MAX_INTEGER)),
+    },
+    Row {
+        attack: "a member that vouches for the leader, which hangs",
+        means: Means::Candidate,
+        on_brokers: false,
+        deeds: (30, "messages"),
+        bar: Bar {
+            longest_gap_ms: Some(1000),
+            is_replaced: Some(true),
+            ..UNHARMED
+        },
+        quick: true,
+        run: |target| Box::pin(vouch(target)),
     },
     Row {
         attack: "maps with the largest round, in the leader's name",
@@ -125,6 +140,27 @@ async fn beats(target: Target, round: u64) -> anyhow::Result<()> {
         life: LifeSign::default(),
     };
     insider.repeat(9, Some(insider.epoch(9)), beat).await
+}
+
+/// Stops the leader's process, and answers every question about it with "it is alive".
+async fn vouch(target: Target) -> anyhow::Result<()> {
+    let insider = join(&target, Role::Auto).await?;
+    let leader = Pid::from_raw(target.leader_process.try_into()?);
+    kill(leader, Signal::SIGSTOP)?;
+    let answer = |(ask, term)| Body::LeaderEvidence {
+        ask,
+        age_ms: 0,
+        life: LifeSign {
+            led_ms: 600_000 * term,
+            signature: None,
+        },
+    };
+    let answers: Vec<_> = (1..=32)
+        .zip([1_u64, 2, 3].into_iter().cycle())
+        .map(answer)
+        .collect();
+    let leader = Epoch::new(1, NodeName::from_static(LEADER));
+    insider.repeat_all(1, Some(leader), &answers).await
 }
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {

@@ -111,6 +111,8 @@ pub(crate) struct Target {
     /// The attacked broker, and that of the candidate which does not lead.
     pub(crate) broker: SocketAddr,
     pub(crate) standby: SocketAddr,
+    /// The leader's process.
+    pub(crate) leader_process: u32,
     /// Where the nodes gossip.
     pub(crate) gossip: Vec<SocketAddr>,
     /// The attacker's own address, another than the cell's.
@@ -135,6 +137,20 @@ impl Target {
     /// Counts deeds.
     pub(crate) fn did(&self, deeds: usize) {
         self.deeds.fetch_add(deeds as u64, Ordering::Relaxed);
+    }
+
+    /// Number of maps accepted since a time that have an object of this vehicle.
+    pub(crate) fn maps_with(&self, vehicle: &str, since: Timestamp) -> anyhow::Result<usize> {
+        let has_object = |line: &Line| {
+            let objects = line.map.objects.iter();
+            objects
+                .flat_map(|object| &object.contributors)
+                .any(|name| name == vehicle)
+        };
+        Ok(maps_in(&self.home, since)?
+            .iter()
+            .filter(|line| has_object(line))
+            .count())
     }
 }
 
@@ -260,6 +276,7 @@ impl Cell {
             deeds: Arc::default(),
             broker: self.nodes[usize::from(victim == Victim::Standby)].broker,
             standby: self.nodes[1].broker,
+            leader_process: self.nodes[0].process.id(),
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
             from: self
                 .network
@@ -321,17 +338,7 @@ impl Cell {
 
     /// Maps that the vehicle has accepted since a time.
     fn maps(&self, since: Timestamp) -> anyhow::Result<Vec<Line>> {
-        let file = self.directory.path().join(OBSERVED).join("maps.jsonl");
-        let text = fs::read_to_string(&file).unwrap_or_default();
-        let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
-        let lines = whole.lines().map(serde_json::from_str::<Line>);
-        let lines = lines
-            .collect::<Result<Vec<_>, _>>()
-            .with_context(|| file.display().to_string())?;
-        Ok(lines
-            .into_iter()
-            .filter(|line| line.received_at_us >= since)
-            .collect())
+        maps_in(self.directory.path(), since)
     }
 
     /// Number of honest nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
@@ -379,6 +386,21 @@ impl Cell {
         self.directory.disable_cleanup(true);
         self.directory.path().to_owned()
     }
+}
+
+/// Maps that the vehicle has accepted since a time, by the cell's directory.
+fn maps_in(home: &Path, since: Timestamp) -> anyhow::Result<Vec<Line>> {
+    let file = home.join(OBSERVED).join("maps.jsonl");
+    let text = fs::read_to_string(&file).unwrap_or_default();
+    let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
+    let lines = whole.lines().map(serde_json::from_str::<Line>);
+    let lines = lines
+        .collect::<Result<Vec<_>, _>>()
+        .with_context(|| file.display().to_string())?;
+    Ok(lines
+        .into_iter()
+        .filter(|line| line.received_at_us >= since)
+        .collect())
 }
 
 /// The part of a map log's line that is needed here.

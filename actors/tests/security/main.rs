@@ -5,6 +5,7 @@ mod certificates;
 mod claims;
 mod descriptions;
 mod evidence;
+mod expiring_leader;
 mod false_rounds;
 mod fixture;
 mod floods;

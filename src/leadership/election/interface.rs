@@ -77,7 +77,8 @@ pub struct Health {
     /// Vehicles' reports are usable: the node does not reject nearly all of them because of their
     /// timestamps.
     pub reports: bool,
-    /// The node uses the cell's description, or there is no leader.
+    /// The node uses the cell's description and its certificate does not end soon, or there is no
+    /// leader.
     pub settings: bool,
     /// Processor load of the machine, 0 to 100 %.
     pub load_percent: u8,

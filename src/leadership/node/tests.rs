@@ -105,6 +105,7 @@ impl Scene {
                         fuser_runs: true,
                         rejects_reports: false,
                         contradicts: false,
+                        certificate_ends: false,
                     },
                 },
                 effect => {

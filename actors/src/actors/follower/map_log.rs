@@ -19,6 +19,12 @@ const RETRY_PAUSE: Duration = Duration::from_secs(10);
 /// The disk therefore holds two of them at most.
 const MAX_BYTES: u64 = 512 * 1024 * 1024;
 
+/// Maximum length of half a line: the largest map.
+const MAX_TORN_BYTES: u64 = 16 * 1024 * 1024;
+
+/// Beginning of each line of the log.
+const LINE_BEGIN: &[u8] = b"{\"cell\":";
+
 /// A file of maps with their times of receipt, one JSON object per line. If the disk fails, only
 /// the log's lines are lost.
 pub(super) struct MapLog {
@@ -82,10 +88,7 @@ impl MapLog {
                     .read(true)
                     .append(true)
                     .open(&self.path)?;
-                if ends_within_a_line(&mut file)? {
-                    file.write_all(b"\n")?;
-                }
-                let bytes = file.metadata()?.len();
+                let bytes = remove_torn_line(&mut file)?;
                 self.file.insert((file, bytes))
             }
         };
@@ -101,15 +104,27 @@ fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     name.into()
 }
 
-/// True if the file ends in half a line, as a crash or a full disk leaves it.
-fn ends_within_a_line(file: &mut File) -> io::Result<bool> {
-    if file.seek(SeekFrom::End(0))? == 0 {
-        return Ok(false);
+/// Removes half a line at the end, as a crash or a full disk leaves it, and returns the size of the
+/// file. Other text at the end stays, followed by a line break.
+fn remove_torn_line(file: &mut File) -> io::Result<u64> {
+    let bytes = file.seek(SeekFrom::End(0))?;
+    let tail_bytes = bytes.min(MAX_TORN_BYTES);
+    file.seek(SeekFrom::Start(bytes - tail_bytes))?;
+    let mut tail = vec![0; tail_bytes as usize];
+    file.read_exact(&mut tail)?;
+    let ends = tail.iter().rposition(|byte| *byte == b'\n');
+    let torn = &tail[ends.map_or(0, |end| end + 1)..];
+    if torn.is_empty() {
+        return Ok(bytes);
     }
-    file.seek(SeekFrom::End(-1))?;
-    let mut last = [0];
-    file.read_exact(&mut last)?;
-    Ok(last != *b"\n")
+    let is_ours = ends.is_some() || tail_bytes == bytes;
+    if is_ours && (torn.starts_with(LINE_BEGIN) || LINE_BEGIN.starts_with(torn)) {
+        let whole = bytes - torn.len() as u64;
+        file.set_len(whole)?;
+        return Ok(whole);
+    }
+    file.write_all(b"\n")?;
+    Ok(bytes + 1)
 }
 
 /// A line of the log, in the format of [`ReceivedMap`].
@@ -141,23 +156,38 @@ mod tests {
     }
 
     #[test]
-    fn a_new_line_begins_on_a_line_of_its_own_after_a_crash() {
+    fn half_a_line_is_removed_after_a_crash() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("maps.jsonl");
-        std::fs::write(&path, "{\"received_at_us\":17,\"sch").unwrap();
         let cell = NodeName::from_static("lot-1");
         let (_present, present_cell) = watch::channel(cell.clone());
-        let mut log = MapLog::new(path.clone(), cell, present_cell);
-        log.append(&map(Timestamp(1)));
-        log.append(&map(Timestamp(2)));
+        let new_log = || MapLog::new(path.clone(), cell.clone(), present_cell.clone());
+        let torn = "{\"cell\":\"lot-1\",\"received_at_us\":17,\"sch";
+        for cut in 1..torn.len() {
+            std::fs::write(&path, "").unwrap();
+            new_log().append(&map(Timestamp(1)));
+            let before = std::fs::read_to_string(&path).unwrap();
+            std::fs::write(&path, before + &torn[..cut]).unwrap();
+            new_log().append(&map(Timestamp(2)));
+            let lines = std::fs::read_to_string(&path).unwrap();
+            let whole: Vec<ReceivedMap> = lines
+                .lines()
+                .map(|line| serde_json::from_str(line).unwrap())
+                .collect();
+            assert_eq!(whole, [map(Timestamp(1)), map(Timestamp(2))], "{cut}");
+        }
+    }
+
+    #[test]
+    fn the_text_of_another_file_is_not_removed() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("notes.txt");
+        std::fs::write(&path, "a note").unwrap();
+        let cell = NodeName::from_static("lot-1");
+        let (_present, present_cell) = watch::channel(cell.clone());
+        MapLog::new(path.clone(), cell, present_cell).append(&map(Timestamp(1)));
         let lines = std::fs::read_to_string(&path).unwrap();
-        let whole = lines
-            .lines()
-            .filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
-        assert_eq!(
-            whole.collect::<Vec<_>>(),
-            [map(Timestamp(1)), map(Timestamp(2))]
-        );
+        assert!(lines.starts_with("a note\n{") && lines.lines().count() == 2);
     }
 
     #[test]

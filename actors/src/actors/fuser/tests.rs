@@ -112,9 +112,9 @@ async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more
         panic!("a map")
     };
     fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
-    fuser.forget_map(&NodeName::from_static("gauss"));
+    fuser.expel(NodeName::from_static("gauss"));
     assert!(fuser.last_map.is_some(), "another's");
-    fuser.forget_map(&NodeName::from_static("edge"));
+    fuser.expel(NodeName::from_static("edge"));
     assert!(fuser.last_map.is_none());
 }
 
@@ -315,6 +315,34 @@ fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
     );
 }
 
+/// The vehicle of an entry that the map leaves out is named, with the reason.
+#[test]
+fn vehicles_whose_objects_the_map_leaves_out_are_named() {
+    let fuser = standby();
+    let entry = |reason, vehicle: &'static str| InvalidEntry {
+        reason,
+        contributors: vec![NodeName::from_static(vehicle)],
+    };
+    fuser.report_left_out(&[
+        entry(RejectReason::TooManyObjects, "mallory"),
+        entry(RejectReason::NotFinite, "watson"),
+    ]);
+    let of = |name: &str, kind: &str, cause: &str| {
+        (Some(name.to_owned()), kind.to_owned(), cause.to_owned())
+    };
+    let share = "the map leaves out objects that only it reports: it has more than its share";
+    let bounds =
+        "the map leaves out an object of its reports, which would be out of bounds: not finite";
+    assert_eq!(
+        troubles(&fuser),
+        [
+            of("mallory", "overload", share),
+            of("watson", "misplaced", bounds)
+        ]
+    );
+    assert_eq!(fuser.counters.events(Event::EntryLeftOut), 2);
+}
+
 #[test]
 fn locations_that_only_one_side_knows_are_named() {
     let now = Timestamp(1_795_000_000_000_000);
@@ -323,7 +351,7 @@ fn locations_that_only_one_side_knows_are_named() {
     take(&mut without, report(1), now, None);
     assert_eq!(troubles(&without), []);
     take(&mut without, report(2), now, Some("slot-0"));
-    let cause = "euclid names known locations, such as slot-0, and this node has none";
+    let cause = "euclid names known locations, such as “slot-0”, and this node has none";
     assert_eq!(
         troubles(&without),
         [(None, "no_locations".into(), cause.into())]
@@ -336,7 +364,7 @@ fn locations_that_only_one_side_knows_are_named() {
     take(&mut with, report(1), now, Some("slot-0"));
     assert_eq!(troubles(&with), []);
     take(&mut with, report(2), now, Some("slot-9"));
-    let cause = "names the location slot-9, which this node does not know";
+    let cause = "names the location “slot-9”, which this node does not know";
     let unknown = [(
         Some("euclid".to_owned()),
         "unknown_location".to_owned(),

@@ -121,7 +121,7 @@ impl ElectionDriver {
             MembershipEvent::Expelled { name } => {
                 self.cell_time.forget(&name);
                 self.life_signs.forget(&name);
-                self.parts.fuser.send(FuserMessage::ForgetMap { of: name });
+                self.parts.fuser.send(FuserMessage::Expel { node: name });
                 return;
             }
             MembershipEvent::Down { name } => Input::MemberDown { name },
@@ -295,7 +295,10 @@ impl ElectionDriver {
                 let troubles = self.counters.troubles().present();
                 return vec![looked, Input::Telling { troubles, page }];
             }
-            Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
+            Effect::AskParts => {
+                let certificate_ends = self.life_signs.credentials().is_some_and(probe::ends_soon);
+                probe::ask_parts(&self.parts, certificate_ends, self.myself.clone());
+            }
             Effect::CountImplausible { from } => self
                 .counters
                 .reject(RejectReason::OutOfRange, from.as_str()),

@@ -40,6 +40,11 @@ impl LifeSigns {
         }
     }
 
+    /// The node's own certificate; `None` in a cell without certificates.
+    pub(super) fn credentials(&self) -> Option<&Credentials> {
+        self.credentials.as_deref()
+    }
+
     /// Stores the certificate of a node that has proven it.
     pub(super) fn meet(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
         let Some(certificate) = certificate else {

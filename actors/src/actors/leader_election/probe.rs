@@ -1,5 +1,7 @@
 //! Non-blocking queries of a node's parts.
 
+use std::time::Duration;
+
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::node::Input;
 use ecod::leadership::timers::ANSWER_STEPS;
@@ -10,10 +12,26 @@ use crate::messages::broker::BrokerMessage;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
+use crate::platform::clock;
 use crate::transport::broker::BrokerHealth;
+use crate::transport::pki::Credentials;
+
+/// Time before the end of the node's certificate in which another candidate should lead: far more
+/// than a handover takes and clocks of a cell differ.
+const CERTIFICATE_MARGIN: Duration = Duration::from_secs(60);
+
+/// True if a certificate ends within [`CERTIFICATE_MARGIN`].
+pub(super) fn ends_soon(credentials: &Credentials) -> bool {
+    let expires = credentials.current().identity.expires();
+    clock::wall() + CERTIFICATE_MARGIN > expires
+}
 
 /// Queries broker, gateway and fuser, and sends their answers to the election.
-pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
+pub(super) fn ask_parts(
+    parts: &Parts,
+    certificate_ends: bool,
+    election: ActorRef<LeaderElectionMessage>,
+) {
     let (broker, gateway, fuser) = (
         parts.broker.clone(),
         parts.gateway.clone(),
@@ -38,6 +56,7 @@ pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>
             fuser_runs,
             rejects_reports,
             contradicts,
+            certificate_ends,
         };
         let input = Input::PartsAnswered { sample };
         if election

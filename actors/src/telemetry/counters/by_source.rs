@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use ecod::admission::report_window::MAX_PARTS;
+use ecod::model::names::vehicle_of;
 use strum::{IntoStaticStr, VariantArray};
 
 /// Reason for which a valid message was not used.
@@ -64,7 +66,8 @@ impl<R> Default for CountsBySource<R> {
     }
 }
 
-/// Maximum sources of each reason with a count of their own; further sources share [`OTHERS`].
+/// Maximum sources of each reason with a count of their own; further sources share [`OTHERS`]. Of
+/// the parts of one vehicle, [`MAX_PARTS`] have one.
 const MAX_TRACKED_SOURCES: usize = 64;
 
 /// Source name under which further sources are counted together.
@@ -79,7 +82,10 @@ impl<R: Copy + Ord> CountsBySource<R> {
             *times += 1;
             return false;
         }
-        let has_room = sources.len() < MAX_TRACKED_SOURCES;
+        let vehicle = vehicle_of(source);
+        let is_part = |known: &&String| vehicle_of(known) == vehicle && **known != vehicle;
+        let has_room = sources.len() < MAX_TRACKED_SOURCES
+            && (source == vehicle || sources.keys().filter(is_part).count() < MAX_PARTS);
         *sources
             .entry(if has_room { source } else { OTHERS }.to_owned())
             .or_default() += 1;
@@ -106,6 +112,21 @@ impl<R: Copy + Ord> CountsBySource<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_parts_of_one_vehicle_leave_room_for_other_sources() {
+        let rejects = CountsBySource::default();
+        for part in 0..1000 {
+            rejects.count(ShedReason::StatusThrottled, &format!("mallory--{part}"));
+        }
+        for source in ["mallory", "gauss", "10.0.0.7"] {
+            assert!(
+                rejects.count(ShedReason::StatusThrottled, source),
+                "{source}"
+            );
+        }
+        assert_eq!(rejects.snapshot().len(), MAX_PARTS + 1 + 3);
+    }
 
     #[test]
     fn sources_are_told_apart_until_there_are_too_many() {
