@@ -58,7 +58,7 @@ impl Election {
         };
         following
             .suspect_at(&self.config)
-            .max(self.questions.last_at() + pause)
+            .max(self.questions.own_at() + pause)
     }
 
     /// Processes a leader's beat or claim.

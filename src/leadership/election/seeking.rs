@@ -46,6 +46,8 @@ impl Seeking {
 pub(super) struct Questions {
     count: u64,
     recent: VecDeque<(u64, Timestamp)>,
+    /// Time of the latest question that this node asked for itself, and not for another node.
+    own_at: Timestamp,
 }
 
 impl Questions {
@@ -67,10 +69,13 @@ impl Questions {
             .map(|(_, at)| *at)
     }
 
-    pub(super) fn last_at(&self) -> Timestamp {
-        self.recent
-            .back()
-            .map_or_else(Timestamp::default, |(_, at)| *at)
+    fn ask_for_itself(&mut self, now: Timestamp) -> u64 {
+        self.own_at = now;
+        self.ask(now)
+    }
+
+    pub(super) fn own_at(&self) -> Timestamp {
+        self.own_at
     }
 }
 
@@ -115,7 +120,7 @@ impl Election {
     }
 
     pub(super) fn ask_all(&mut self, now: Timestamp) {
-        let ask = self.questions.ask(now);
+        let ask = self.questions.ask_for_itself(now);
         self.send_all(&Body::Ask { ask }, now);
     }
 
@@ -126,7 +131,7 @@ impl Election {
         };
         let near = following.successors.iter().filter(|name| **name != self.id);
         let near: Vec<_> = near.chain([&following.epoch.leader]).cloned().collect();
-        let ask = self.questions.ask(now);
+        let ask = self.questions.ask_for_itself(now);
         for peer in near {
             self.send(&peer, Body::Ask { ask }, now);
         }

@@ -844,3 +844,43 @@ fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
         (Some(&edge), old.term)
     );
 }
+
+/// Nodes that one split cuts off from their leader suspect it at about the same time, and ask each
+/// other. Whoever passes another node's question on must still ask for itself: without a question
+/// of its own it would wait for the claims of nodes on the other side.
+#[test]
+fn questions_of_other_nodes_do_not_delay_the_own_question() {
+    let (edge, gauss) = (
+        NodeName::from_static("edge"),
+        NodeName::from_static("gauss"),
+    );
+    let epoch = epoch_of_edge();
+    let at = |ms: u64| NOW + Duration::from_millis(ms);
+    let mut euclid = euclid();
+    let near_beat = Body::Beat {
+        every_ms: 400,
+        round: 1,
+        followers: 1,
+        after: None,
+        successors: vec![gauss.clone()],
+        life: LifeSign::default(),
+    };
+    euclid.handle(of_edge(1, 8, near_beat), at(0));
+    for round in 1..=4 {
+        let accepted = ElectionInput::Round {
+            epoch: epoch.clone(),
+            round,
+        };
+        euclid.handle(accepted, at(100 * (round - 1)));
+    }
+    let asks = |effects: Vec<ElectionEffect>| {
+        let is_question = |effect: &ElectionEffect| {
+            matches!(effect, ElectionEffect::Send { to, message }
+                if *to == edge && matches!(message.body, Body::Ask { .. }))
+        };
+        effects.iter().any(is_question)
+    };
+    let question = received(&gauss, 1, Some(&epoch), Body::Ask { ask: 1 });
+    assert!(asks(euclid.handle(question, at(440))), "it is passed on");
+    assert!(asks(euclid.tick(at(451))));
+}
