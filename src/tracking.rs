@@ -7,22 +7,24 @@
 //! are learnt from what it has in common with the others. Received maps lend identities and no evidence: no track is
 //! spawned or kept alive by them.
 
+mod assignment;
 mod calibration;
+mod class;
 mod config;
 mod coverage;
 mod detection_history;
 mod existence;
 mod foreign;
-mod gating;
 mod gauge;
 mod grid;
 mod handles;
 mod kinematics;
 mod lifecycle;
-mod neighbours;
 mod occlusion;
+mod population;
 mod pose_bias;
 mod registration;
+mod scan;
 mod sensors;
 mod store;
 #[cfg(test)]
@@ -31,6 +33,7 @@ mod track;
 mod tracker;
 mod trust;
 mod turning;
+mod twins;
 mod update;
 
 use std::collections::BTreeMap;

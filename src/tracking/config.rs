@@ -26,8 +26,8 @@ pub enum TracksMode {
 pub struct TracksConfig {
     /// When objects are tracked: `auto`, the default, in a cell without known locations; `on`; `off`.
     pub mode: TracksMode,
-    /// Standard deviation in metres, in each direction, of positions reported without covariance, until it is learnt.
-    /// Default 0.3.
+    /// Standard deviation in metres, in each direction, of near positions without covariance, until it
+    /// is estimated; 0.012 m more for each metre of distance. Default 0.15.
     pub noise_m: f64,
     /// Minimum standard deviation in metres of any reported position. Default 0.1.
     pub noise_floor_m: f64,
@@ -45,8 +45,11 @@ pub struct TracksConfig {
     pub speed_mps: f64,
     /// Maximum speed in metres per second. Default 70.
     pub max_speed_mps: f64,
-    /// Maximum time in seconds for which an object is kept after its last detection. Default 3.
+    /// Maximum time in seconds for which an object is published after its last detection. Default 3.
     pub life_s: f64,
+    /// Maximum time in seconds for which an object keeps its identity after its last detection, published or not.
+    /// Default 8.
+    pub latent_s: f64,
     /// Maximum time in seconds of a report behind the latest that was fused. Default 0.5; later reports are counted.
     pub max_lag_s: f64,
     /// Confidence at which a detection is as likely real as not, until it is learnt. Default 0.3.
@@ -79,7 +82,7 @@ impl Default for TracksConfig {
     fn default() -> Self {
         Self {
             mode: TracksMode::Auto,
-            noise_m: 0.3,
+            noise_m: 0.15,
             noise_floor_m: 0.1,
             common_m: 0.2,
             gate_sigmas: 3.5,
@@ -88,6 +91,7 @@ impl Default for TracksConfig {
             speed_mps: 8.0,
             max_speed_mps: 70.0,
             life_s: 3.0,
+            latent_s: 8.0,
             max_lag_s: 0.5,
             even_confidence: 0.3,
             min_confidence: 0.002,
@@ -119,6 +123,7 @@ impl TracksConfig {
         check_range("speed_mps", self.speed_mps, 1e-3, 100.0)?;
         check_range("max_speed_mps", self.max_speed_mps, self.speed_mps, 1e3)?;
         check_range("life_s", self.life_s, 0.05, 60.0)?;
+        check_range("latent_s", self.latent_s, self.life_s, 600.0)?;
         check_range("max_lag_s", self.max_lag_s, 0.0, 10.0)?;
         check_range("even_confidence", self.even_confidence, 0.01, 0.99)?;
         check_range("min_confidence", self.min_confidence, 0.0, 1.0)?;
@@ -141,11 +146,6 @@ impl TracksConfig {
     /// Maximum squared Mahalanobis distance of a detection from its track.
     pub(super) fn gate(&self) -> f64 {
         self.gate_sigmas * self.gate_sigmas
-    }
-
-    /// Density of the white noise acceleration, m²/s³.
-    pub(super) fn density(&self) -> f64 {
-        self.manoeuvre_mps * self.manoeuvre_mps
     }
 
     /// Standard deviations of pose biases at rest.

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Vector2;
 
-use super::existence::DetectionRates;
+use super::existence::{DetectionRates, LookState};
 use crate::wire::{FieldOfView, ObjectReport, PerceivedObject};
 
 /// Learnt field of view and detection rates of one vehicle.
@@ -20,53 +20,32 @@ pub(super) struct Coverage {
     /// Number of detections above which a direction is in view.
     min_detections: f32,
     /// Detection rates by distance from the centre.
-    rates: [Bin; Self::BINS],
+    rates: [DetectionRates; Self::BINS],
     farthest_m: f64,
-}
-
-/// Hits and looks at objects that exist, after a hit and after a miss.
-#[derive(Debug, Clone, Copy)]
-struct Bin {
-    after_hit: (f32, f32),
-    after_miss: (f32, f32),
 }
 
 impl Default for Coverage {
     fn default() -> Self {
-        let DetectionRates {
-            after_hit,
-            after_miss,
-        } = DetectionRates::PRIOR;
-        let prior = |rate: f64| (rate as f32 * Self::PRIOR_LOOKS, Self::PRIOR_LOOKS);
-        let bin = Bin {
-            after_hit: prior(after_hit),
-            after_miss: prior(after_miss),
-        };
         Self {
             pose: None,
             stated: None,
             centre: None,
             directions: [0.0; Self::DIRECTIONS],
             min_detections: 0.0,
-            rates: [bin; Self::BINS],
+            rates: [DetectionRates::object(); Self::BINS],
             farthest_m: 0.0,
         }
     }
 }
 
 impl Coverage {
-    const BINS: usize = 16;
-    const BIN_M: f64 = 10.0;
+    /// Bins of distance, each twice as wide as the one before, and the end of the first in metres.
+    const BINS: usize = 6;
+    const FIRST_BIN_M: f64 = 5.0;
     const DIRECTIONS: usize = 24;
 
     /// Maximum range, metres.
-    const MAX_RANGE_M: f64 = Self::BIN_M * Self::BINS as f64;
-
-    /// Number of looks that the prior rates count as.
-    const PRIOR_LOOKS: f32 = 20.0;
-
-    /// Number of looks in a bin beyond which older ones are forgotten.
-    const MEMORY: f32 = 400.0;
+    const MAX_RANGE_M: f64 = 160.0;
 
     /// Distance in metres that no vehicle covers between two reports.
     const JUMP_M: f64 = 500.0;
@@ -130,36 +109,25 @@ impl Coverage {
     }
 
     /// Detection rates at a reported position, if nothing hides it; `None` outside the field of view.
-    pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<DetectionRates> {
+    pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<&DetectionRates> {
         let offset = reported - self.centre?;
         let distance_m = offset.norm();
         if distance_m > self.range_m() || !self.faces(&offset, distance_m) {
             return None;
         }
-        let bin = &self.rates[Self::bin(distance_m)];
-        let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
-        Some(DetectionRates {
-            after_hit: rate(bin.after_hit),
-            after_miss: rate(bin.after_miss),
-        })
+        Some(&self.rates[Self::bin(distance_m)])
     }
 
-    /// Learns from a look at an object that certainly exists; `was_hit` is the result of the look before.
-    pub(super) fn learn(&mut self, reported: &Vector2<f64>, was_hit: bool, is_hit: bool) {
+    /// Learns from a look at an object that exists with a probability; `state` is that before the look.
+    pub(super) fn learn(
+        &mut self,
+        reported: &Vector2<f64>,
+        state: LookState,
+        is_hit: bool,
+        probability: f64,
+    ) {
         let Some(centre) = self.centre else { return };
-        let bin = &mut self.rates[Self::bin((reported - centre).norm())];
-        let (hits, looks) = if was_hit {
-            &mut bin.after_hit
-        } else {
-            &mut bin.after_miss
-        };
-        *hits += f32::from(u8::from(is_hit));
-        *looks += 1.0;
-        if *looks > Self::MEMORY {
-            let kept = Self::MEMORY / *looks;
-            *hits *= kept;
-            *looks *= kept;
-        }
+        self.rates[Self::bin((reported - centre).norm())].learn(state, is_hit, probability);
     }
 
     fn faces(&self, offset: &Vector2<f64>, distance_m: f64) -> bool {
@@ -180,7 +148,14 @@ impl Coverage {
     }
 
     fn bin(distance_m: f64) -> usize {
-        ((distance_m / Self::BIN_M) as usize).min(Self::BINS - 1)
+        let mut end_m = Self::FIRST_BIN_M;
+        for bin in 0..Self::BINS - 1 {
+            if distance_m <= end_m {
+                return bin;
+            }
+            end_m *= 2.0;
+        }
+        Self::BINS - 1
     }
 }
 

@@ -14,6 +14,7 @@ use nalgebra::Vector2;
 use uuid::Uuid;
 
 use super::HandOvers;
+use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::existence::JUDGED_AFTER;
 use super::handles::{SensorId, TrackIndex};
@@ -77,10 +78,15 @@ pub(super) struct ForeignObject {
 impl ForeignObject {
     fn new(stated: &NeighbourObject, fused_at: Timestamp, config: &TracksConfig) -> Self {
         let NeighbourObject { cell, object, .. } = stated;
-        let mut track = Track::new(object.id, fused_at, &measurement(object, config), config);
+        let mut track = Track::new(
+            object.id,
+            fused_at,
+            &measurement(object, config),
+            ObjectClass::of(&object.label, config),
+        );
         track.inherit(object, fused_at);
         if let Some(velocity) = object.velocity_mps {
-            lend_velocity(&mut track.state, fused_at, velocity.into(), config);
+            lend_velocity(&mut track.state, fused_at, velocity.into());
         }
         Self {
             cell: cell.clone(),
@@ -100,8 +106,8 @@ impl ForeignObject {
     }
 
     /// The object with its errors at `at`, as a measurement.
-    fn measured_at(&self, at: Timestamp, config: &TracksConfig) -> Measurement {
-        let independent = self.track.state.covariance_at(at, config.density());
+    fn measured_at(&self, at: Timestamp) -> Measurement {
+        let independent = self.track.state.covariance_at(at);
         Measurement {
             position: self.track.state.position_at(at),
             independent,
@@ -111,10 +117,7 @@ impl ForeignObject {
 
     /// Squared distance from a track in standard deviations, if both can be one object at `at`.
     fn distance_from(&self, track: &Track, at: Timestamp, config: &TracksConfig) -> Option<f64> {
-        let innovation =
-            track
-                .state
-                .innovation(at, &self.measured_at(at, config), config.density());
+        let innovation = track.state.innovation(at, &self.measured_at(at));
         let velocity = self.track.state.velocity - track.state.velocity;
         let variance = (self.track.state.velocity_covariance() + track.state.velocity_covariance())
             .trace()
@@ -324,10 +327,7 @@ impl ForeignObjects {
     ) -> Option<&ForeignObject> {
         let candidates = self.objects.iter().filter(|object| object.same.is_none());
         let near = candidates.filter_map(|object| {
-            let innovation = object
-                .track
-                .state
-                .innovation(at, measurement, config.density());
+            let innovation = object.track.state.innovation(at, measurement);
             let is_near = innovation.offset.norm() <= config.gate_m
                 && innovation.distance_squared <= config.gate();
             let is_like = |detected| object.track.label_similarity(detected) > MIN_LABEL_SIMILARITY;
@@ -357,22 +357,22 @@ impl ForeignObject {
         measurement: &Measurement,
         config: &TracksConfig,
     ) -> Track {
-        let mut track = Track::new(self.track.id, at, measurement, config);
+        let mut track = Track::new(
+            self.track.id,
+            at,
+            measurement,
+            ObjectClass::of(&self.stated.object.label, config),
+        );
         track.inherit(&self.stated.object, at);
         if let Some(velocity) = self.stated.object.velocity_mps {
-            lend_velocity(&mut track.state, at, velocity.into(), config);
+            lend_velocity(&mut track.state, at, velocity.into());
         }
         track
     }
 }
 
-fn lend_velocity(
-    state: &mut KinematicState,
-    at: Timestamp,
-    velocity: Vector2<f64>,
-    config: &TracksConfig,
-) {
+fn lend_velocity(state: &mut KinematicState, at: Timestamp, velocity: Vector2<f64>) {
     let sigma_mps = VELOCITY_SIGMA_MPS.hypot(VELOCITY_SIGMA_SHARE * velocity.norm());
-    state.update_velocity(at, velocity, sigma_mps, config.density());
-    state.limit_speed(config.max_speed_mps);
+    state.update_velocity(at, velocity, sigma_mps);
+    state.limit_speed();
 }

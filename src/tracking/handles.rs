@@ -13,12 +13,5 @@ impl SensorId {
 
 /// Position of a track in the store. `TrackStore` alone creates it. Nothing keeps one across `TrackStore::retain`, which
 /// invalidates it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct TrackIndex(pub(super) u32);
-
-impl TrackIndex {
-    /// Number of the track, the oldest first.
-    pub(super) fn number(self) -> u32 {
-        self.0
-    }
-}

@@ -9,6 +9,7 @@
 
 use nalgebra::{Matrix2, Vector2};
 
+use super::class::ObjectClass;
 use crate::model::time::Timestamp;
 
 /// Measured position of an object in one frame, with its errors.
@@ -26,8 +27,6 @@ pub(super) struct Measurement {
 pub(super) struct Innovation {
     /// Measured less predicted position, metres.
     pub(super) offset: Vector2<f64>,
-    /// Covariance of the offset, m².
-    pub(super) covariance: Matrix2<f64>,
     /// Squared Mahalanobis distance.
     pub(super) distance_squared: f64,
 }
@@ -36,6 +35,8 @@ pub(super) struct Innovation {
 #[derive(Debug, Clone)]
 pub(super) struct KinematicState {
     pub(super) at: Timestamp,
+    /// How the object may move.
+    pub(super) class: ObjectClass,
     /// Metres.
     pub(super) position: Vector2<f64>,
     /// m/s.
@@ -49,15 +50,16 @@ pub(super) struct KinematicState {
 }
 
 impl KinematicState {
-    /// The state after one measurement; `speed_mps` is the standard deviation of the velocity in each direction.
-    pub(super) fn new(at: Timestamp, measurement: &Measurement, speed_mps: f64) -> Self {
+    /// The state after one measurement: the velocity is unknown.
+    pub(super) fn new(at: Timestamp, measurement: &Measurement, class: ObjectClass) -> Self {
         Self {
             at,
+            class,
             position: measurement.position,
             velocity: Vector2::zeros(),
             pp: measurement.independent,
             pv: Matrix2::zeros(),
-            vv: Matrix2::identity() * (speed_mps * speed_mps),
+            vv: Matrix2::identity() * class.speed_mps.powi(2),
             common_m: measurement.common_m,
         }
     }
@@ -73,8 +75,8 @@ impl KinematicState {
     }
 
     /// Covariance of the position at `at`, both parts, m².
-    pub(super) fn covariance_at(&self, at: Timestamp, density: f64) -> Matrix2<f64> {
-        self.independent_at(self.seconds_to(at), density) + isotropic(self.common_m)
+    pub(super) fn covariance_at(&self, at: Timestamp) -> Matrix2<f64> {
+        self.independent_at(self.seconds_to(at)) + isotropic(self.common_m)
     }
 
     /// Covariance of the velocity, (m/s)².
@@ -82,8 +84,8 @@ impl KinematicState {
         &self.vv
     }
 
-    fn independent_at(&self, dt: f64, density: f64) -> Matrix2<f64> {
-        let drift = density * dt.abs().powi(3) / 3.0;
+    fn independent_at(&self, dt: f64) -> Matrix2<f64> {
+        let drift = self.class.acceleration_density() * dt.abs().powi(3) / 3.0;
         self.pp
             + (self.pv + self.pv.transpose()) * dt
             + self.vv * (dt * dt)
@@ -91,12 +93,12 @@ impl KinematicState {
     }
 
     /// Moves the state to `at`; an earlier time changes nothing.
-    pub(super) fn predict(&mut self, at: Timestamp, density: f64) {
-        let dt = self.seconds_to(at);
+    pub(super) fn predict(&mut self, at: Timestamp) {
+        let (dt, density) = (self.seconds_to(at), self.class.acceleration_density());
         if dt <= 0.0 {
             return;
         }
-        self.pp = self.independent_at(dt, density);
+        self.pp = self.independent_at(dt);
         self.pv += self.vv * dt + Matrix2::identity() * (density * dt * dt / 2.0);
         self.vv += Matrix2::identity() * (density * dt);
         self.position += self.velocity * dt;
@@ -104,21 +106,14 @@ impl KinematicState {
     }
 
     /// The innovation of a measurement taken at `at`.
-    pub(super) fn innovation(
-        &self,
-        at: Timestamp,
-        measurement: &Measurement,
-        density: f64,
-    ) -> Innovation {
+    pub(super) fn innovation(&self, at: Timestamp, measurement: &Measurement) -> Innovation {
         let offset = measurement.position - self.position_at(at);
-        let covariance = self.covariance_at(at, density)
-            + measurement.independent
-            + isotropic(measurement.common_m);
+        let covariance =
+            self.covariance_at(at) + measurement.independent + isotropic(measurement.common_m);
         let distance_squared =
             inverse(&covariance).map_or(f64::INFINITY, |inverse| offset.dot(&(inverse * offset)));
         Innovation {
             offset,
-            covariance,
             distance_squared,
         }
     }
@@ -127,18 +122,18 @@ impl KinematicState {
     ///
     /// A measurement from before the state's time is compared with the position at its own time (Bar-Shalom, "Update
     /// with out-of-sequence measurements in tracking", 2002). The process noise in between counts in full.
-    pub(super) fn update(&mut self, at: Timestamp, measurement: &Measurement, density: f64) {
-        self.predict(at, density);
+    pub(super) fn update(&mut self, at: Timestamp, measurement: &Measurement) {
+        self.predict(at);
         let dt = self.seconds_to(at).min(0.0);
-        let noise = self.independent_at(dt, density) + measurement.independent;
-        let total = noise + isotropic(self.common_m) + isotropic(measurement.common_m);
+        let noise = self.independent_at(dt) + measurement.independent;
+        let total = noise + isotropic(measurement.common_m);
         let Some(inverse) = inverse(&total) else {
             return;
         };
         let offset = measurement.position - self.position_at(at);
         let at_position = self.pp + self.pv * dt;
         let at_velocity = self.pv.transpose() + self.vv * dt;
-        let position_gain = (at_position + isotropic(self.common_m)) * inverse;
+        let position_gain = at_position * inverse;
         let velocity_gain = at_velocity * inverse;
         self.position += position_gain * offset;
         self.velocity += velocity_gain * offset;
@@ -160,9 +155,9 @@ impl KinematicState {
         at: Timestamp,
         velocity: Vector2<f64>,
         sigma_mps: f64,
-        density: f64,
     ) {
-        let stated = sigma_mps * sigma_mps + density * self.seconds_to(at).abs();
+        let stated =
+            sigma_mps * sigma_mps + self.class.acceleration_density() * self.seconds_to(at).abs();
         let known = self.vv.trace() / 2.0;
         if known <= stated {
             return;
@@ -197,9 +192,18 @@ impl KinematicState {
         self.vv += Matrix2::identity() * (speed_mps * speed_mps);
     }
 
-    /// Limits the speed to `max_mps`.
-    pub(super) fn limit_speed(&mut self, max_mps: f64) {
-        let speed = self.velocity.norm();
+    /// Adapts the covariance to a manoeuvre: a normalised innovation of `excess` times the expected one means that the
+    /// state is that much less certain (fading memory; Bar-Shalom et al. 2001, section 11.2).
+    pub(super) fn adapt(&mut self, excess: f64) {
+        self.pp *= excess;
+        self.pv *= excess;
+        self.vv *= excess;
+        self.inflate_velocity_covariance(self.class.manoeuvre_mps);
+    }
+
+    /// Limits the speed to the maximum of the class.
+    pub(super) fn limit_speed(&mut self) {
+        let (speed, max_mps) = (self.velocity.norm(), self.class.max_speed_mps);
         if speed > max_mps {
             self.velocity *= max_mps / speed;
         }
@@ -215,7 +219,7 @@ fn symmetric(matrix: Matrix2<f64>) -> Matrix2<f64> {
 }
 
 /// The inverse of a covariance; `None` unless its determinant is positive and finite.
-fn inverse(covariance: &Matrix2<f64>) -> Option<Matrix2<f64>> {
+pub(super) fn inverse(covariance: &Matrix2<f64>) -> Option<Matrix2<f64>> {
     let determinant = covariance.determinant();
     covariance
         .try_inverse()

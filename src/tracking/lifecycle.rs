@@ -6,9 +6,12 @@ use std::time::Duration;
 use nalgebra::Vector2;
 use uuid::Uuid;
 
+use super::class::ObjectClass;
 use super::config::TracksConfig;
+use super::existence::{LookState, SensorHistory};
 use super::handles::TrackIndex;
 use super::kinematics::Measurement;
+use super::population::Population;
 use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::track::Track;
@@ -25,100 +28,99 @@ const MERGE_UNLIKE_M: f64 = 1.0;
 /// The same in standard deviations.
 const MERGE_SIGMAS: f64 = 3.0;
 
+/// Probability of a detection by a vehicle whose view is unknown.
+const UNKNOWN_RATE: f64 = 0.9;
+
 /// Time for which a silent vehicle is remembered after its last object.
 const REMEMBERED: Duration = Duration::from_secs(10);
 
-/// Minimum survival probability of a track.
-const MIN_SURVIVAL: f64 = 0.02;
+/// Maximum existence at which a track that was never confirmed ends.
+const MIN_EXISTENCE: f64 = 0.005;
 
-/// Two tracks near each other.
-struct Neighbouring {
-    older: TrackIndex,
-    later: TrackIndex,
-    /// Whether a vehicle resolves them as two objects.
-    is_resolved: bool,
-}
-
-/// Merges tracks of one object: near each other, and not resolved by a vehicle. The older one stays.
-pub(super) fn merge(tracks: &mut TrackStore, now: Timestamp, config: &TracksConfig) {
+/// Merges tracks of one object; the older one stays.
+pub(super) fn merge(
+    tracks: &mut TrackStore,
+    sensors: &Sensors,
+    now: Timestamp,
+    config: &TracksConfig,
+) {
     tracks.reindex(now);
-    let neighbouring = neighbouring(tracks, now);
-    for Neighbouring {
-        older,
-        later,
-        is_resolved,
-    } in &neighbouring
-    {
-        let (id, seen) = (tracks[*later].id, tracks[*later].last_seen);
-        let track = &mut tracks[*older];
-        track
-            .neighbours
-            .observe(id, *is_resolved, seen.max(track.last_seen));
-    }
     let mut merged = BTreeSet::new();
-    for Neighbouring {
-        older,
-        later,
-        is_resolved,
-    } in neighbouring
-    {
-        // A merge before may have separated the older track from this one.
-        let is_candidate = !is_resolved && !merged.contains(&older) && !merged.contains(&later);
-        if is_candidate && is_same(&tracks[older], &tracks[later], now, config) {
+    for (older, later) in near_pairs(tracks, now, config) {
+        let rate = |history: &SensorHistory| {
+            let sensor = sensors.get(history.sensor);
+            sensor
+                .and_then(|sensor| sensor.coverage.rates_at(&history.position))
+                .map_or(UNKNOWN_RATE, |rates| rates.rate(LookState::Hit(1)))
+        };
+        let mut twins = std::mem::take(&mut tracks[older].twins);
+        let other = &tracks[later];
+        twins.weigh(&tracks[older].history, &other.history, other.id, now, rate);
+        let is_twin = twins.is_twin(other.id);
+        tracks[older].twins = twins;
+        if is_twin && !merged.contains(&older) && merged.insert(later) {
             tracks.merge(older, later);
-            merged.insert(later);
         }
     }
     tracks.retain(|index, _| !merged.contains(&index));
 }
 
-fn neighbouring(tracks: &TrackStore, now: Timestamp) -> Vec<Neighbouring> {
-    let mut neighbouring = Vec::new();
+/// Pairs of tracks that may be one object, the older track first.
+fn near_pairs(
+    tracks: &TrackStore,
+    now: Timestamp,
+    config: &TracksConfig,
+) -> Vec<(TrackIndex, TrackIndex)> {
+    let mut pairs = Vec::new();
     for (older, track) in tracks.indexed() {
         let position = track.state.position_at(now);
         tracks.near(&position, MERGE_M, |indexed| {
-            let (later, other) = (indexed.track, &tracks[indexed.track]);
-            if later > older && (other.state.position_at(now) - position).norm() < MERGE_M {
-                neighbouring.push(Neighbouring {
-                    older,
-                    later,
-                    is_resolved: track.is_resolved_from(other),
-                });
+            let later = indexed.track;
+            if later > older && may_be_one(track, &tracks[later], now, config) {
+                pairs.push((older, later));
             }
         });
     }
-    neighbouring
+    pairs
 }
 
-fn is_same(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) -> bool {
+fn may_be_one(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) -> bool {
     let distance_m = (other.state.position_at(now) - track.state.position_at(now)).norm();
     let are_vehicles = track.vehicle.is_some() && other.vehicle.is_some();
     let are_unlike = track.label(config) != other.label(config) && distance_m >= MERGE_UNLIKE_M;
-    if are_vehicles
-        || are_unlike
-        || track.is_resolved_from(other)
-        || track.neighbours.is_separate(other.id, now)
-    {
-        return false;
-    }
-    let density = config.density();
-    let covariance =
-        track.state.covariance_at(now, density) + other.state.covariance_at(now, density);
-    distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
+    let covariance = track.state.covariance_at(now) + other.state.covariance_at(now);
+    distance_m < MERGE_M
+        && !are_vehicles
+        && !are_unlike
+        && distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
 }
 
 /// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than any track lives.
 pub(super) fn prune(
     tracks: &mut TrackStore,
     sensors: &mut Sensors,
+    population: &mut Population,
     now: Timestamp,
     config: &TracksConfig,
 ) {
-    let life = Duration::from_secs_f64(config.life_s);
+    let [life, latent] = [config.life_s, config.latent_s].map(Duration::from_secs_f64);
     tracks.retain(|_, track| {
-        now.since(track.last_seen) <= life && track.survival(now) > MIN_SURVIVAL
+        let unseen = now.since(track.last_seen);
+        let is_kept = if track.is_confirmed() {
+            unseen <= latent
+        } else {
+            unseen <= life && track.existence.probability() >= MIN_EXISTENCE
+        };
+        if !is_kept {
+            if track.is_settled {
+                population.leave();
+            } else {
+                population.settle(false);
+            }
+        }
+        is_kept
     });
-    if sensors.forget_silent(now - life - REMEMBERED) {
+    if sensors.forget_silent(now - latent - REMEMBERED) {
         tracks.retain_vehicles(|vehicle| sensors.get(vehicle).is_some());
     }
 }
@@ -152,13 +154,12 @@ pub(super) fn adopt_map(
             tracks[track].id = object.id;
             continue;
         }
-        let mut track = Track::new(object.id, now, &measurement, config);
+        let class = ObjectClass::of(&object.label, config);
+        let mut track = Track::new(object.id, now, &measurement, class);
         if let Some([x, y]) = object.velocity_mps {
-            track
-                .state
-                .update_velocity(now, Vector2::new(x, y), 1.0, config.density());
+            track.state.update_velocity(now, Vector2::new(x, y), 1.0);
         }
-        track.state.limit_speed(config.max_speed_mps);
+        track.state.limit_speed();
         track.inherit(object, now);
         tracks.add(track);
     }
@@ -169,7 +170,7 @@ pub(super) fn measurement(object: &FusedObject, config: &TracksConfig) -> Measur
     Measurement {
         position: Vector2::new(object.x_m, object.y_m),
         independent: (object.covariance() + floor).matrix(),
-        common_m: config.common_m,
+        common_m: ObjectClass::of(&object.label, config).common_m,
     }
 }
 

@@ -29,6 +29,9 @@ const STANDS_S: f64 = 1.0;
 /// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
 const MAX_WEIGHT: f64 = 100.0;
 
+/// Time in seconds for which a vehicle sees an object from the same side.
+const SAME_SIDE_S: f64 = 10.0;
+
 /// Minimum number of correspondences of a published correction.
 const MIN_PAIRS: f64 = 3.0;
 
@@ -59,6 +62,8 @@ pub(super) struct Correspondence {
     pub(super) variance: f64,
     /// Variance of the error that the references may share, m².
     pub(super) common: f64,
+    /// Variance of what the vehicle is wrong about this object for as long as it sees it from the same side, m².
+    pub(super) of_object: f64,
 }
 
 /// Estimated pose bias of one vehicle.
@@ -168,12 +173,15 @@ impl PoseBias {
         pairs: &[Correspondence],
         prior: &BiasPrior,
     ) -> f64 {
+        let passed_s = at.since(self.at).as_secs_f64().clamp(0.01, SAME_SIDE_S);
         let kept = self.fade(at, prior);
-        self.fit(delay_s, pairs, prior);
+        self.fit(delay_s, pairs, SAME_SIDE_S / passed_s, prior);
         kept
     }
 
-    fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
+    /// Updates the estimate; an object is seen from the same side in so many `frames`, which together say no more of its
+    /// own error than one.
+    fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], frames: f64, prior: &BiasPrior) {
         let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty())
         else {
             return;
@@ -188,10 +196,12 @@ impl PoseBias {
                 let arm = rotation * (pair.reported - self.pivot);
                 let later = pair.velocity * (self.error.w - delay_s);
                 let residual = pair.reference - (self.pivot + arm + offset) - later;
-                let squared = residual.norm_squared() / (pair.variance + pair.common);
+                let variance = pair.variance + pair.of_object;
+                let squared = residual.norm_squared() / (variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // More references do not reduce the error that they share.
-                let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
+                let variance = pair.variance + frames * pair.of_object;
+                let weight = trust / (variance + pair.common * pairs.len() as f64);
                 normal.add(
                     &Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]),
                     &residual,
@@ -328,6 +338,7 @@ mod tests {
                     velocity: Vector2::zeros(),
                     variance: 0.04,
                     common: 0.02,
+                    of_object: 0.0,
                 }
             };
             let pairs: Vec<_> = (0..12).map(pair).collect();
@@ -366,6 +377,7 @@ mod tests {
                     velocity,
                     variance: 0.08,
                     common: 0.02,
+                    of_object: 0.0,
                 }
             };
             let pairs: Vec<_> = (0..6).map(pair).collect();

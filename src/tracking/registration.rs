@@ -24,6 +24,8 @@ pub(super) struct RegistrationFrame {
     /// Time of capture: the stamp less `delay_s`, the estimate at that time.
     pub(super) at: Timestamp,
     pub(super) delay_s: f64,
+    /// True if the vehicle has jumped to another place: its earlier frames are void.
+    pub(super) has_jumped: bool,
     pub(super) samples: Vec<RegistrationSample>,
 }
 
@@ -103,6 +105,7 @@ impl Correspondence {
             velocity,
             variance: sample.variance * (1.0 + 1.0 / weight),
             common: common / weight,
+            of_object: 2.0 * track.state.class.common_m.powi(2),
         })
     }
 }

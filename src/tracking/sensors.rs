@@ -9,11 +9,10 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
-use super::existence::{ClutterRates, DetectionRates, LookRates, SensorQuality, USUAL_LOOKS_HZ};
+use super::existence::{DetectionRates, LookRates, LookState};
 use super::handles::SensorId;
 use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
-use crate::model::geometry::Covariance;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
@@ -29,11 +28,6 @@ const MIN_RANGE_M: f64 = 10.0;
 
 /// Time after which a vehicle that states no pose and stays is known to stand.
 const STAYS_FOR: Duration = Duration::from_secs(120);
-
-/// Bounds of the time between two reports in seconds, and the weight of the latest in its mean.
-const MIN_INTERVAL_S: f64 = 0.02;
-const MAX_INTERVAL_S: f64 = 1.0;
-const INTERVAL_GAIN: f64 = 0.2;
 
 /// Models of the vehicles that are heard, and the trust in all.
 #[derive(Debug, Clone)]
@@ -100,6 +94,12 @@ impl Sensors {
         self.models.get_mut(id.number())?.as_deref_mut()
     }
 
+    /// The model of a vehicle that is heard, mutable, and the trust in all.
+    pub(super) fn with_fleet(&mut self, id: SensorId) -> Option<(&mut SensorModel, &mut Fleet)> {
+        let model = self.models.get_mut(id.number())?.as_deref_mut()?;
+        Some((model, &mut self.fleet))
+    }
+
     /// The model of a vehicle that is heard, by name.
     pub(super) fn by_name(&self, node: &NodeName) -> Option<&SensorModel> {
         self.get(*self.ids.get(node)?)
@@ -113,15 +113,6 @@ impl Sensors {
     /// The same, mutable.
     pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut SensorModel> {
         self.models.iter_mut().flatten().map(Box::as_mut)
-    }
-
-    /// Properties of all vehicles that their evidence depends on, by number.
-    pub(super) fn qualities(&self) -> Vec<SensorQuality> {
-        let quality = |model: &SensorModel| model.quality(self.fleet.trust(model.id));
-        self.models
-            .iter()
-            .map(|slot| slot.as_deref().map(quality).unwrap_or_default())
-            .collect()
     }
 
     /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
@@ -193,8 +184,6 @@ pub(super) struct SensorModel {
     pub(super) id: SensorId,
     pub(super) node: NodeName,
     last_report: Timestamp,
-    /// Fading mean of the time between two reports, seconds; none before the second.
-    interval_s: Option<f64>,
     pose: Option<WirePose>,
     /// Place about which the median of its detections stays, metres, and since when.
     place: (Vector2<f64>, Timestamp),
@@ -202,7 +191,7 @@ pub(super) struct SensorModel {
     pub(super) noise: NoiseModel,
     pub(super) calibration: DetectionCalibration,
     pub(super) coverage: Coverage,
-    pub(super) clutter: ClutterRates,
+    pub(super) clutter: DetectionRates,
     pub(super) counts: TrustCounts,
 }
 
@@ -218,35 +207,39 @@ impl SensorModel {
             id,
             node,
             last_report: at,
-            interval_s: None,
             pose: None,
             place: (Vector2::zeros(), at),
             pose_bias: PoseBias::new(at, &config.bias_prior()),
             noise: NoiseModel::default(),
             calibration: DetectionCalibration::new(config.even_confidence),
             coverage: Coverage::default(),
-            clutter: ClutterRates::default(),
+            clutter: DetectionRates::clutter(),
             counts,
         }
     }
 
-    /// Properties that its evidence of any object depends on, with its trust.
-    fn quality(&self, trust: f64) -> SensorQuality {
-        let looks_hz = self
-            .interval_s
-            .map_or(USUAL_LOOKS_HZ, |interval_s| 1.0 / interval_s);
-        SensorQuality {
-            trust,
-            looks_hz,
-            even_excess: self.calibration.even_excess(),
+    /// Rates at a look at a reported position in this state; `None` outside the field of view.
+    pub(super) fn look_rates(
+        &self,
+        reported: &Vector2<f64>,
+        state: LookState,
+    ) -> Option<LookRates> {
+        let object = self.coverage.rates_at(reported)?;
+        Some(self.rates(object, state))
+    }
+
+    /// Rates at a detection in this state, which may be outside the field of view.
+    pub(super) fn hit_rates(&self, reported: &Vector2<f64>, state: LookState) -> LookRates {
+        match self.coverage.rates_at(reported) {
+            Some(object) => self.rates(object, state),
+            None => self.rates(&DetectionRates::object(), state),
         }
     }
 
-    /// Rates at a look, with those of an object.
-    pub(super) fn look_rates(&self, object: DetectionRates) -> LookRates {
+    fn rates(&self, object: &DetectionRates, state: LookState) -> LookRates {
         LookRates {
-            object,
-            clutter: self.clutter.rates(),
+            object: object.rate(state),
+            clutter: self.clutter.rate(state),
             is_view_stated: self.coverage.is_stated(),
         }
     }
@@ -260,11 +253,6 @@ impl SensorModel {
     ) -> bool {
         let passed_s = at.since(self.last_report).as_secs_f64();
         self.last_report = self.last_report.max(at);
-        if passed_s > 0.0 {
-            let passed_s = passed_s.clamp(MIN_INTERVAL_S, MAX_INTERVAL_S);
-            let mean_s = self.interval_s.unwrap_or(passed_s);
-            self.interval_s = Some(mean_s + INTERVAL_GAIN * (passed_s - mean_s));
-        }
         let is_placed = self.coverage.centre().is_some();
         let has_jumped = self.coverage.observe(report);
         if has_jumped {
@@ -306,60 +294,139 @@ impl SensorModel {
     }
 }
 
-/// Scatter of reported positions about their tracks, as a multiple of the stated covariance.
-#[derive(Debug, Clone)]
+/// Noise of a vehicle's positions, learnt by distance along and across the line of sight.
+///
+/// Reported covariances are scaled: the model learns the ratio of the squared residuals to them. Without, it learns the
+/// variances themselves, from a prior that grows with the distance.
+#[derive(Debug, Clone, Default)]
 pub(super) struct NoiseModel {
-    scale: f64,
-    weight: f64,
+    scale: Learnt,
+    bins: [NoiseBin; Self::BINS],
 }
 
-impl Default for NoiseModel {
-    fn default() -> Self {
-        Self {
-            scale: 1.0,
-            weight: 30.0,
-        }
+/// Variances at one distance, m².
+#[derive(Debug, Clone, Copy, Default)]
+struct NoiseBin {
+    along: Learnt,
+    across: Learnt,
+}
+
+/// Sum and number of the latest values.
+#[derive(Debug, Clone, Copy, Default)]
+struct Learnt {
+    sum: f64,
+    count: f64,
+}
+
+impl Learnt {
+    /// Number of values as which a prior counts, and beyond which older values are forgotten.
+    const PRIOR: f64 = 30.0;
+    const MEMORY: f64 = 500.0;
+
+    /// The mean beside a prior.
+    fn mean(&self, prior: f64) -> f64 {
+        (prior * Self::PRIOR + self.sum) / (Self::PRIOR + self.count)
     }
+
+    fn learn(&mut self, value: f64) {
+        self.sum += value;
+        self.count += 1.0;
+        let kept = (Self::MEMORY / self.count).min(1.0);
+        self.sum *= kept;
+        self.count *= kept;
+    }
+}
+
+/// Residual of a detection from its track.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Residual {
+    /// Measured less estimated position, metres.
+    pub(super) offset: Vector2<f64>,
+    /// Variance of the estimate in each direction, m²: positive if the detection took part in it.
+    pub(super) variance: f64,
 }
 
 impl NoiseModel {
-    /// Weight beyond which older detections are forgotten.
-    const MEMORY: f64 = 500.0;
+    /// Bins of distance and their width in metres.
+    const BINS: usize = 6;
+    const BIN_M: f64 = 10.0;
 
-    /// Covariance of a reported position, m².
+    /// Increase of the prior's standard deviation with the distance, and the share of it across the line of sight.
+    const PER_METRE: f64 = 0.012;
+    const ACROSS: f64 = 0.5;
+
+    /// Maximum ratio of a squared residual to the present variance that is learnt from.
+    const MAX_RATIO: f64 = 16.0;
+
+    /// Variances along and across the line of sight at a distance, m².
+    fn variances(&self, distance_m: f64, config: &TracksConfig) -> [f64; 2] {
+        let prior = |share: f64| (config.noise_m + share * Self::PER_METRE * distance_m).powi(2);
+        let NoiseBin { along, across } = &self.bins[Self::bin(distance_m)];
+        [along.mean(prior(1.0)), across.mean(prior(Self::ACROSS))]
+    }
+
+    fn bin(distance_m: f64) -> usize {
+        ((distance_m / Self::BIN_M) as usize).min(Self::BINS - 1)
+    }
+
+    /// Ratio of the squared residuals to the stated covariance, which is a lower bound.
+    fn scale(&self) -> f64 {
+        self.scale.mean(1.0).max(1.0)
+    }
+
+    /// Covariance of a reported position, m², of a vehicle at `origin`.
     pub(super) fn covariance(
         &self,
         object: &PerceivedObject,
+        origin: Option<&Vector2<f64>>,
         config: &TracksConfig,
     ) -> Matrix2<f64> {
         let floor = Matrix2::identity() * (config.noise_floor_m * config.noise_floor_m);
-        stated(object, config).matrix() * self.scale + floor
+        if let Some(stated) = object.covariance() {
+            return stated.matrix() * self.scale() + floor;
+        }
+        let Some(origin) = origin else {
+            let [along, across] = self.variances(0.0, config);
+            return Matrix2::identity() * ((along + across) / 2.0) + floor;
+        };
+        let offset = Vector2::new(object.x_m, object.y_m) - origin;
+        let [along, across] = self.variances(offset.norm(), config);
+        let sight = sight(&offset);
+        Matrix2::identity() * across + sight * sight.transpose() * (along - across) + floor
     }
 
-    /// Learns from the squared distance of a detection from a well-known track, m²; `expected` is the track's part of it.
+    /// Learns from the residual of a detection from a well-known track.
     pub(super) fn learn(
         &mut self,
         object: &PerceivedObject,
-        squared: f64,
-        expected: f64,
+        origin: Option<&Vector2<f64>>,
+        residual: &Residual,
         config: &TracksConfig,
     ) {
-        let stated = stated(object, config);
-        let ratio = ((squared - expected) / (stated.xx + stated.yy)).clamp(0.0, 25.0);
-        self.weight = (self.weight + 1.0).min(Self::MEMORY);
-        self.scale += (ratio - self.scale) / self.weight;
-        // A stated covariance is a lower bound.
-        let min = if object.covariance_m2.is_some() {
-            1.0
-        } else {
-            0.05
+        let bounded = |squared: f64, mean: f64| {
+            (squared + residual.variance).clamp(0.0, Self::MAX_RATIO * mean)
         };
-        self.scale = self.scale.max(min);
+        let offset = &residual.offset;
+        if let Some(stated) = object.covariance() {
+            let stated = (stated.xx + stated.yy) / 2.0;
+            let squared = bounded(offset.norm_squared() / 2.0, self.scale() * stated);
+            self.scale.learn(squared / stated);
+            return;
+        }
+        let from = origin.map(|origin| Vector2::new(object.x_m, object.y_m) - origin);
+        let distance_m = from.map_or(0.0, |from| from.norm());
+        let squares = match from.map(|from| sight(&from)) {
+            Some(sight) => [sight.dot(offset).powi(2), sight.perp(offset).powi(2)],
+            None => [offset.norm_squared() / 2.0; 2],
+        };
+        let variances = self.variances(distance_m, config);
+        let NoiseBin { along, across } = &mut self.bins[Self::bin(distance_m)];
+        along.learn(bounded(squares[0], variances[0]));
+        across.learn(bounded(squares[1], variances[1]));
     }
 }
 
-fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
-    object
-        .covariance()
-        .unwrap_or_else(|| Covariance::isotropic(config.noise_m))
+/// Unit vector of a line of sight.
+fn sight(offset: &Vector2<f64>) -> Vector2<f64> {
+    offset.try_normalize(1e-6).unwrap_or_else(Vector2::x)
 }

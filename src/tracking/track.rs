@@ -7,22 +7,21 @@ use nalgebra::Vector2;
 use smallvec::SmallVec;
 use uuid::Uuid;
 
+use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
-use super::existence::{
-    BaseRate, MAX_DENIAL_NATS, SensorHistory, SensorQuality, alone_nats, logistic, persistence_nats,
-};
+use super::existence::{Existence, SensorHistory, logistic};
 use super::grid::IndexedTrack;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
-use super::neighbours::TrackNeighbours;
+use super::twins::Twins;
 use crate::model::geometry::{Covariance, wrap_angle};
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
 /// Maximum age of another vehicle's detection that confirms a track.
-const CONFIRMED_WITHIN: Duration = Duration::from_millis(500);
+const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
 
 /// Maximum number of labels of a track; the likeliest stay.
 const MAX_LABELS: usize = 8;
@@ -35,20 +34,16 @@ const USABLE_M: f64 = 1.5;
 
 /// Rate at which the probability of a position error falls, in standard deviations: errors of associated detections have
 /// an exponential tail.
-const ERROR_RATE: f64 = 1.23;
+const ERROR_RATE: f64 = 1.6;
 
-/// Rate at which objects disappear, per second.
-const DISAPPEARANCE_RATE: f64 = 0.02;
+/// Number of detections that confirm a track.
+pub(super) const CONFIRMED_HITS: u32 = 5;
 
-/// Time constant in seconds with which an unseen object disappears.
-const UNSEEN_S: f64 = 2.0;
+/// Maximum evidence of an object that one vehicle alone detects, nats, where others look and do not.
+const SOLE_NATS: f64 = 2.0;
 
-/// Time before its last detection within which a vehicle must have looked at an object to count as one that looks at it:
-/// as long as evidence lasts. An object that all have left gets no surer by that.
-const LOOKS_FOR: Duration = Duration::from_secs(3);
-
-/// Power at which survival enters the odds of existence: tracks are kept for longer than their objects are likely there.
-const SURVIVAL_POWER: f64 = 3.1;
+/// Time after which a detection says no more that its object is there.
+const DETECTED_WITHIN: Duration = Duration::from_secs(1);
 
 /// State of one track.
 #[derive(Debug, Clone)]
@@ -65,19 +60,19 @@ pub(super) struct Track {
     size_m: Option<[f64; 2]>,
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
-    /// Odds that the object has disappeared since it was last seen.
-    disappeared: f64,
+    /// Existence by the results of all looks.
+    pub(super) existence: Existence,
+    /// True if the last look of any vehicle was a detection.
+    is_detected: bool,
+    /// True if the track has been counted as an object.
+    pub(super) is_settled: bool,
     /// The vehicle that this track is, by its reported pose.
     pub(super) vehicle: Option<SensorId>,
     /// Number of detections.
     pub(super) hits: u32,
     /// Number of identities taken over from neighbouring cells.
     pub(super) renames: u8,
-    pub(super) neighbours: TrackNeighbours,
-    /// Log-odds from another aggregator, which fade, and the time at which they came.
-    inherited: Option<(f64, Timestamp)>,
-    /// Probability that the track never was an object, by the last estimate.
-    pub(super) clutter: Option<f64>,
+    pub(super) twins: Twins,
 }
 
 impl Track {
@@ -86,11 +81,11 @@ impl Track {
         id: Uuid,
         at: Timestamp,
         measurement: &Measurement,
-        config: &TracksConfig,
+        class: ObjectClass,
     ) -> Self {
         Self {
             id,
-            state: KinematicState::new(at, measurement, config.speed_mps),
+            state: KinematicState::new(at, measurement, class),
             history: DetectionHistory::default(),
             labels: SmallVec::new(),
             heading_rad: None,
@@ -98,13 +93,13 @@ impl Track {
             size_m: None,
             first_seen: at,
             last_seen: at,
-            disappeared: 0.0,
+            existence: Existence::new(f64::NEG_INFINITY, at),
+            is_detected: true,
+            is_settled: false,
             vehicle: None,
             hits: 0,
             renames: 0,
-            neighbours: TrackNeighbours::default(),
-            inherited: None,
-            clutter: None,
+            twins: Twins::default(),
         }
     }
 
@@ -153,19 +148,7 @@ impl Track {
     /// Records a detection at `at`.
     pub(super) fn record_hit(&mut self, at: Timestamp) {
         self.last_seen = self.last_seen.max(at);
-        self.disappeared = 0.0;
         self.hits = self.hits.saturating_add(1);
-    }
-
-    /// Records a miss at `at` by a vehicle that had detected the object and last looked `dt_s` before; `rate` is its
-    /// probability of detection.
-    pub(super) fn record_miss(&mut self, at: Timestamp, dt_s: f64, rate: f64) {
-        if at > self.last_seen {
-            // It was there when another vehicle saw it meanwhile.
-            let unseen_s = dt_s.min(at.since(self.last_seen).as_secs_f64());
-            self.disappeared =
-                ((self.disappeared + DISAPPEARANCE_RATE * unseen_s) / (1.0 - rate)).min(1e6);
-        }
     }
 
     /// Similarity of a detection's labels to those of the track, 0 to 1.
@@ -190,75 +173,51 @@ impl Track {
         common.max(MIN_LABEL_SIMILARITY)
     }
 
-    /// Estimates whether the track is of an object; returns the probability that it is still there. `base_rate` are the
-    /// log-odds of any track, `quality` weighs the evidence of each vehicle.
-    pub(super) fn estimate_existence(
-        &mut self,
-        at: Timestamp,
-        base_rate: f64,
-        quality: impl Fn(SensorId) -> SensorQuality,
-    ) -> f64 {
-        let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
-        let (mut looks_hz, mut most_trusted) = (0.0, 0.0f64);
-        let (mut witnesses, mut even_excess) = (0, None);
-        let looking_since = self.last_seen - LOOKS_FOR;
-        for history in self.history.iter() {
-            let sensor = quality(history.sensor);
-            let (shared, denial) = history.shared_nats(at);
-            evidence += sensor.trust * shared;
-            denied += sensor.trust * denial;
-            if history.last_look >= looking_since {
-                looks_hz += sensor.trust * sensor.looks_hz;
-                most_trusted = most_trusted.max(sensor.trust);
-            }
-            if history.last_hit.is_some() && sensor.trust > 0.0 {
-                witnesses += 1;
-                detected = sensor.trust.max(detected);
-                even_excess = Some(
-                    even_excess
-                        .unwrap_or(sensor.even_excess)
-                        .min(sensor.even_excess),
-                );
-            }
-        }
-        let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
-        let inherited = self.inherited.map_or(0.0, |(nats, since)| {
-            nats * (-at.since(since).as_secs_f64()).exp()
+    /// True if too few detections say how fast the object is.
+    pub(super) fn may_have_any_velocity(&self) -> bool {
+        !self.is_confirmed() && self.vehicle.is_none()
+    }
+
+    /// True if enough detections confirm the track.
+    pub(super) fn is_confirmed(&self) -> bool {
+        self.hits >= CONFIRMED_HITS
+    }
+
+    /// Predicts the existence to `at`; `leaving_hz` is the rate at which objects leave.
+    pub(super) fn predict_existence(&mut self, at: Timestamp, leaving_hz: f64) {
+        self.existence.predict(at, leaving_hz, self.is_detected);
+    }
+
+    /// Takes note of whether any vehicle detects the object at `at`.
+    pub(super) fn note_detected(&mut self, at: Timestamp) {
+        self.is_detected = self.history.iter().any(|history| {
+            history.state.is_hit() && at.since(history.last_look) <= DETECTED_WITHIN
         });
-        let evidence = if witnesses < 2 {
-            evidence - denied.min(MAX_DENIAL_NATS)
+    }
+
+    /// Probability that the object is there at `at`, by looks and confidences; `trust` is that in a vehicle, 0 to 1.
+    pub(super) fn existence_at(
+        &self,
+        at: Timestamp,
+        leaving_hz: f64,
+        trust: impl Fn(SensorId) -> f64,
+    ) -> f64 {
+        let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
+        let looks = self.existence.log_odds_at(at, leaving_hz, is_detected);
+        let (mut confidences, mut denied, mut witnesses) = (0.0, 0.0, 0);
+        for history in self.history.iter() {
+            let trust = trust(history.sensor);
+            confidences += trust * history.shared_confidence_nats(at);
+            denied += trust * history.denied_nats(at);
+            witnesses += usize::from(history.last_hit.is_some() && trust > 0.0);
+        }
+        let nats = looks + confidences;
+        // What deceives one vehicle deceives it again and again.
+        if witnesses < 2 && denied < 0.0 && self.vehicle.is_none() {
+            logistic(nats.min(SOLE_NATS) + denied)
         } else {
-            evidence
-        };
-        // Looks count beside each other, not less for all: those who are trusted little find an object no surer by that.
-        let looks_hz = if most_trusted > 0.0 {
-            looks_hz / most_trusted
-        } else {
-            0.0
-        };
-        let alone = alone_nats(looks_hz, even_excess.unwrap_or_default());
-        let nats = base_rate + alone + evidence + detected * persistence + inherited;
-        self.clutter = Some(logistic(-nats));
-        logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
-    }
-
-    /// The only vehicle that detects the object, if there is but one.
-    pub(super) fn only_witness(&self) -> Option<SensorId> {
-        let mut witnesses = self.witnesses();
-        witnesses.next().filter(|_| witnesses.next().is_none())
-    }
-
-    fn witnesses(&self) -> impl Iterator<Item = SensorId> {
-        self.history
-            .iter()
-            .filter(|history| history.last_hit.is_some())
-            .map(|history| history.sensor)
-    }
-
-    /// Probability that an object that existed is still there.
-    pub(super) fn survival(&self, now: Timestamp) -> f64 {
-        let age = now.since(self.last_seen).as_secs_f64();
-        (-age / UNSEEN_S).exp() / (1.0 + self.disappeared)
+            logistic(nats)
+        }
     }
 
     /// The histories of the vehicles that detected the object since `limit`.
@@ -269,22 +228,9 @@ impl Track {
     }
 
     /// Whether another vehicle than `sensor` detected the object shortly before `at`.
-    pub(super) fn is_confirmed(&self, sensor: SensorId, at: Timestamp) -> bool {
+    pub(super) fn is_seen_by_others(&self, sensor: SensorId, at: Timestamp) -> bool {
         self.seen_by(at - CONFIRMED_WITHIN)
             .any(|history| history.sensor != sensor)
-    }
-
-    /// True if a vehicle detected both objects in the frame of its last detection. Detections of long ago do not count: a
-    /// duplicate of then would stay for as long as the vehicle.
-    pub(super) fn is_resolved_from(&self, other: &Self) -> bool {
-        let since = self.last_seen.max(other.last_seen) - LOOKS_FOR;
-        self.history.iter().any(|own| {
-            own.last_hit.is_some_and(|hit| hit >= since)
-                && other
-                    .history
-                    .iter()
-                    .any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
-        })
     }
 
     /// Merges a later track of the same object; the identity and labels of this one stay.
@@ -293,9 +239,7 @@ impl Track {
         if self.last_seen < other.last_seen {
             self.state = other.state;
             self.last_seen = other.last_seen;
-            self.disappeared = other.disappeared;
         }
-        self.neighbours.merge(other.neighbours, self.id);
         self.hits = self.hits.saturating_add(other.hits);
         self.vehicle = self.vehicle.or(other.vehicle);
         self.heading_rad = self.heading_rad.or(other.heading_rad);
@@ -309,8 +253,7 @@ impl Track {
             .existence
             .unwrap_or(object.confidence)
             .clamp(0.01, 0.99);
-        let alone = BaseRate::usual_log_odds() + alone_nats(0.0, 0.0);
-        self.inherited = Some(((existence / (1.0 - existence)).ln() - alone, at));
+        self.existence = Existence::new((existence / (1.0 - existence)).ln(), at);
         self.first_seen = object
             .first_seen_us
             .map_or(self.first_seen, |first| first.min(self.first_seen));
@@ -331,7 +274,7 @@ impl Track {
         existence: f64,
         name: impl Fn(SensorId) -> Option<NodeName>,
     ) -> FusedObject {
-        let covariance = self.state.covariance_at(now, config.density());
+        let covariance = self.state.covariance_at(now);
         let position = self.state.position_at(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
@@ -390,28 +333,5 @@ impl Track {
         let velocity: Vector2<f64> = self.state.velocity;
         let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();
         (velocity.norm() > (3.0 * sigma).max(1.0)).then(|| velocity.y.atan2(velocity.x))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_object_that_one_camera_has_just_detected_is_still_there_for_others_that_miss_it() {
-        let config = TracksConfig::default();
-        let (before, at) = (Timestamp(1_000_000), Timestamp(1_500_000));
-        let independent = nalgebra::Matrix2::identity() * 0.01;
-        let measurement = Measurement {
-            position: Vector2::zeros(),
-            independent,
-            common_m: 0.0,
-        };
-        let mut track = Track::new(Uuid::nil(), before, &measurement, &config);
-        track.record_hit(at);
-        (1..=3).for_each(|ms| track.record_miss(at + Duration::from_millis(ms), 0.5, 0.9));
-        assert!(track.survival(at) > 0.8, "survival {}", track.survival(at));
-        (1..=3).for_each(|ms| track.record_miss(at + Duration::from_millis(500 + ms), 0.5, 0.9));
-        assert!(track.survival(at) < 0.1, "survival {}", track.survival(at));
     }
 }

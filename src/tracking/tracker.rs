@@ -2,18 +2,17 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::config::TracksConfig;
-use super::existence::BaseRate;
 use super::foreign::ForeignObjects;
-use super::handles::SensorId;
 use super::lifecycle::{adopt_map, merge, prune};
+use super::population::Population;
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
 use super::store::TrackStore;
-use super::track::Track;
 use super::turning::TurningFrame;
-use super::update::{ReportOutcome, ReportUpdate};
+use super::update::InstantUpdate;
 use super::{HandOvers, TracksLosses, TracksRound};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -31,13 +30,15 @@ pub struct Tracker {
     pub(super) sensors: Sensors,
     tracks: TrackStore,
     foreign: ForeignObjects,
-    base_rate: BaseRate,
+    population: Population,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
     frame: TurningFrame,
     /// Time of the latest report that was fused.
     fused_until: Timestamp,
     late: u64,
+    /// Time of the last round.
+    closed_at: Timestamp,
     /// Time from which judgements become evidence.
     recorded_from: Timestamp,
 }
@@ -49,12 +50,13 @@ impl Tracker {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
             foreign: ForeignObjects::default(),
-            base_rate: BaseRate::default(),
+            population: Population::default(),
             config,
             pending: Vec::new(),
             frame: TurningFrame::default(),
             fused_until: Timestamp(0),
             late: 0,
+            closed_at: Timestamp::default(),
             recorded_from: Timestamp::default(),
         }
     }
@@ -178,8 +180,26 @@ impl Tracker {
         if self.config.align {
             register(frames, &self.tracks, &mut self.sensors, &self.config);
         }
-        merge(&mut self.tracks, now, &self.config);
-        prune(&mut self.tracks, &mut self.sensors, now, &self.config);
+        merge(&mut self.tracks, &self.sensors, now, &self.config);
+        let passed_s = now
+            .since(self.closed_at)
+            .as_secs_f64()
+            .min(self.config.life_s);
+        let present = self
+            .tracks
+            .iter()
+            .filter(|track| track.is_settled)
+            .map(|track| track.existence.probability())
+            .sum::<f64>();
+        self.population.stay(present * passed_s);
+        self.closed_at = self.closed_at.max(now);
+        prune(
+            &mut self.tracks,
+            &mut self.sensors,
+            &mut self.population,
+            now,
+            &self.config,
+        );
         self.foreign
             .forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
         let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
@@ -215,50 +235,39 @@ impl Tracker {
         reports
     }
 
-    /// Updates the tracks by each report; returns what registration needs, and judgements of the vehicles.
+    /// Updates the tracks, instant by instant; returns what registration needs, and judgements of the vehicles.
     fn update(
         &mut self,
         reports: &[Captured],
         now: Timestamp,
     ) -> (Vec<RegistrationFrame>, Vec<Evidence>) {
-        let (mut frames, mut evidence): (Vec<RegistrationFrame>, Vec<Evidence>) =
-            Default::default();
+        let mut frames: Vec<RegistrationFrame> = Vec::new();
+        let mut evidence = Vec::new();
         self.tracks
             .reindex(reports.first().map_or(now, |report| report.at));
-        for Captured {
-            at,
-            delay_s,
-            report,
-        } in reports
-        {
-            let (at, delay_s) = (*at, *delay_s);
+        for instant in reports.chunk_by(|a, b| a.at == b.at && a.report.node != b.report.node) {
+            let at = instant[0].at;
             self.tracks.reindex_if_stale(at);
-            let (sensor, fleet) = self.sensors.hear(&report.node, at, &self.config);
-            let id = sensor.id;
-            let update = ReportUpdate::new(
-                &self.config,
-                &mut self.tracks,
-                (sensor, fleet),
-                &mut self.foreign,
-                report,
+            let update = InstantUpdate {
+                config: &self.config,
+                tracks: &mut self.tracks,
+                sensors: &mut self.sensors,
+                foreign: &mut self.foreign,
+                population: &mut self.population,
                 at,
-            );
-            let ReportOutcome {
-                has_jumped,
-                samples,
-                evidence: judged,
-            } = update.run();
-            if has_jumped {
-                frames.retain(|earlier| earlier.sensor != id);
+            };
+            let reports = instant
+                .iter()
+                .map(|captured| (&*captured.report, captured.delay_s));
+            let outcome = update.run(reports);
+            for frame in outcome.frames {
+                if frame.has_jumped {
+                    frames.retain(|earlier| earlier.sensor != frame.sensor);
+                }
+                frames.push(frame);
             }
-            frames.push(RegistrationFrame {
-                sensor: id,
-                at,
-                delay_s,
-                samples,
-            });
             if at >= self.recorded_from {
-                evidence.extend(judged);
+                evidence.extend(outcome.evidence);
             }
             self.fused_until = self.fused_until.max(at);
         }
@@ -266,24 +275,22 @@ impl Tracker {
     }
 
     fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
-        let qualities = self.sensors.qualities();
-        let quality = |id: SensorId| qualities[id.number()];
+        let fleet = &self.sensors.fleet;
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
-        let base_rate = self.base_rate.log_odds();
-        let mut existences = Vec::with_capacity(self.tracks.len());
-        existences.extend(
-            self.tracks
-                .iter_mut()
-                .map(|track| track.estimate_existence(now, base_rate, quality)),
-        );
-        let witnesses = self.tracks.iter().map(Track::only_witness);
-        self.base_rate
-            .learn(now, witnesses.zip(existences.iter().copied()));
-        let tracks = self.tracks.iter().zip(existences);
-        let objects =
-            tracks.map(|(track, existence)| track.object(now, &self.config, existence, name));
+        let leaving_hz = self.population.leaving_hz();
         let mut published = Vec::with_capacity(self.tracks.len());
-        published.extend(objects.filter(|object| object.confidence >= self.config.min_confidence));
+        let seen_since = now - Duration::from_secs_f64(self.config.life_s);
+        for track in self
+            .tracks
+            .iter()
+            .filter(|track| track.last_seen >= seen_since)
+        {
+            let existence = track.existence_at(now, leaving_hz, |id| fleet.trust(id));
+            let object = track.object(now, &self.config, existence, name);
+            if object.confidence >= self.config.min_confidence {
+                published.push(object);
+            }
+        }
         published
     }
 

@@ -1,23 +1,26 @@
-//! Update of the tracks by one report.
+//! Update of the tracks by all reports of one instant.
 //!
-//! [`ReportUpdate::run`] updates the vehicle's own track, associates the detections with tracks, updates those, counts
-//! misses of the others in view, and spawns tracks from what is left.
+//! [`InstantUpdate::run`] updates the tracks of the reporting vehicles themselves, [associates](super::assignment) the
+//! detections of all vehicles with tracks, updates each track once with all its detections, weighs what every vehicle
+//! found where it looked, learns from it, and spawns tracks from what is left.
 
 use nalgebra::{Matrix2, Vector2};
 
-use super::calibration::log_odds;
+use super::assignment::{Assignment, Hypothesis};
+use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{DetectionRates, ExistenceStatement, LookRates};
+use super::existence::{ExistenceStatement, LookRates, LookState};
 use super::foreign::ForeignObjects;
-use super::handles::TrackIndex;
+use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
-use super::occlusion::OcclusionMap;
-use super::registration::RegistrationSample;
-use super::sensors::SensorModel;
+use super::population::Population;
+use super::registration::{RegistrationFrame, RegistrationSample};
+use super::scan::{Scan, ScannedDetection};
+use super::sensors::{Residual, SensorModel, Sensors};
 use super::store::TrackStore;
 use super::track::Track;
-use super::trust::{Fleet, Judgement};
+use super::trust::Judgement;
 use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
 use crate::wire::{ObjectReport, PerceivedObject};
@@ -25,500 +28,595 @@ use crate::wire::{ObjectReport, PerceivedObject};
 /// Standard deviation of reported velocities, m/s.
 const VELOCITY_SIGMA_MPS: f64 = 1.0;
 
-/// Minimum trust by which the covariances of positions are divided.
-const MIN_TRUST: f64 = 0.05;
+/// Normalised innovation squared, of two dimensions, above which an object manoeuvres.
+const MANOEUVRE: f64 = 5.0;
 
-/// Number of detections from which a track measures the noise of detections.
-const MATURE_HITS: u32 = 8;
-
-/// Number of detections from which a track measures pose biases and detection rates.
-pub(super) const ESTABLISHED_HITS: u32 = 5;
+/// Probability above which a track is certain enough to measure the noise of detections.
+const CERTAIN: f64 = 0.9;
 
 /// Maximum number of objects of each neighbouring cell that are compared with a report.
 const MAX_FOREIGN_EACH: usize = 32;
 
-/// Log-odds of a vehicle's confidence that it exists itself.
+/// Log-odds that a vehicle exists that states its own pose.
 const OWN_NATS: f64 = 4.0;
 
-/// A detection of a report, corrected by the estimated pose bias.
-pub(super) struct TimedDetection<'a> {
-    /// Index into the objects of the report.
-    pub(super) index: usize,
-    pub(super) object: &'a PerceivedObject,
-    /// Log-odds of the confidence.
-    log_odds: f64,
-    /// Position as reported, metres.
-    reported: Vector2<f64>,
-    pub(super) measurement: Measurement,
-}
-
-/// Update of the tracks by one report of one vehicle.
-pub(super) struct ReportUpdate<'a> {
-    pub(super) config: &'a TracksConfig,
-    pub(super) tracks: &'a mut TrackStore,
-    pub(super) sensor: &'a mut SensorModel,
-    pub(super) at: Timestamp,
-    fleet: &'a mut Fleet,
-    foreign: &'a mut ForeignObjects,
-    report: &'a ObjectReport,
-    /// Weight of the vehicle's evidence before the update, 0 to 1.
-    trust: f64,
-    occlusion: OcclusionMap,
-    outcome: ReportOutcome,
-}
-
-/// Result of an update.
+/// Result of one instant.
 #[derive(Debug, Default)]
-pub(super) struct ReportOutcome {
-    /// Whether the vehicle has jumped to another place, so that its earlier samples are void.
-    pub(super) has_jumped: bool,
-    pub(super) samples: Vec<RegistrationSample>,
-    /// Judgements of the vehicle's statements.
+pub(super) struct InstantOutcome {
+    pub(super) frames: Vec<RegistrationFrame>,
+    /// Judgements of the vehicles' statements.
     pub(super) evidence: Vec<Evidence>,
 }
 
-impl<'a> ReportUpdate<'a> {
-    /// An update by `report`, captured at `at`; the sensor model takes note of it.
-    pub(super) fn new(
-        config: &'a TracksConfig,
-        tracks: &'a mut TrackStore,
-        (sensor, fleet): (&'a mut SensorModel, &'a mut Fleet),
-        foreign: &'a mut ForeignObjects,
-        report: &'a ObjectReport,
-        at: Timestamp,
-    ) -> Self {
-        let has_jumped = sensor.observe(report, at, config);
-        let is_likely = sensor.calibration.likely();
-        let mut occlusion = OcclusionMap::new(sensor.coverage.position());
-        for object in report
-            .objects
-            .iter()
-            .filter(|object| is_likely(object.confidence))
-        {
-            occlusion.add(object, config.vehicle_radius_m);
-        }
-        let trust = fleet.trust(sensor.id);
-        let samples = Vec::with_capacity(report.objects.len());
-        let outcome = ReportOutcome {
-            has_jumped,
-            samples,
-            evidence: Vec::new(),
-        };
-        Self {
-            config,
-            tracks,
-            sensor,
-            at,
-            fleet,
-            foreign,
-            report,
-            trust,
-            occlusion,
-            outcome,
-        }
-    }
+/// Look of one vehicle at one track.
+struct Look {
+    track: TrackIndex,
+    /// Number of the scan.
+    scan: usize,
+    /// Number of the detection, if the look was one.
+    detection: Option<usize>,
+    /// Where the vehicle would have reported the object, metres.
+    place: Vector2<f64>,
+    rates: LookRates,
+    /// State before the look.
+    state: LookState,
+    /// True if the place is in the field of view.
+    is_in_view: bool,
+    /// True if another detection of the vehicle may hide the place.
+    is_hidden: bool,
+}
 
-    /// Carries out the update.
-    pub(super) fn run(mut self) -> ReportOutcome {
-        if self.is_trusted() {
-            self.update_own_track();
-        }
-        let detections = self.detections();
-        let mut pairings = self.associate(&detections);
-        if self.is_trusted() {
-            self.associate_fast(&detections, &mut pairings);
-        }
-        let mut detected: Vec<TrackIndex> = pairings.iter().map(|pairing| pairing.track).collect();
-        detected.sort_unstable();
-        let mut pairings = pairings.iter().peekable();
-        let mut unassociated = Vec::new();
-        for (number, detection) in detections.iter().enumerate() {
-            match pairings.next_if(|pairing| pairing.detection == number) {
-                Some(pairing) => self.update_track(pairing.track, detection),
-                None => unassociated.push(detection),
+/// Update of the tracks by all reports of one instant.
+pub(super) struct InstantUpdate<'a> {
+    pub(super) config: &'a TracksConfig,
+    pub(super) tracks: &'a mut TrackStore,
+    pub(super) sensors: &'a mut Sensors,
+    pub(super) foreign: &'a mut ForeignObjects,
+    pub(super) population: &'a mut Population,
+    pub(super) at: Timestamp,
+}
+
+impl InstantUpdate<'_> {
+    /// Carries out the update by reports with the corrections of their stamps in seconds.
+    pub(super) fn run<'r>(
+        mut self,
+        reports: impl IntoIterator<Item = (&'r ObjectReport, f64)>,
+    ) -> InstantOutcome {
+        let mut scans = Vec::new();
+        for (report, delay_s) in reports {
+            let (sensor, fleet) = self.sensors.hear(&report.node, self.at, self.config);
+            let (id, trust) = (sensor.id, fleet.trust(sensor.id));
+            let has_jumped = sensor.observe(report, self.at, self.config);
+            if trust > 0.0 {
+                self.update_own_track(id, report);
+            }
+            if let Some(sensor) = self.sensors.get(id) {
+                scans.push(Scan {
+                    delay_s,
+                    has_jumped,
+                    ..Scan::new(sensor, report, trust, self.config)
+                });
             }
         }
-        self.count_misses(&detected);
-        self.look_at_foreign(&detections);
-        if self.is_trusted() {
-            unassociated
-                .into_iter()
-                .for_each(|detection| self.spawn(detection));
+        let hypotheses = Assignment::of(&scans, self.tracks, self.sensors, self.at, self.config);
+        let mut outcome = InstantOutcome::default();
+        outcome
+            .frames
+            .extend(scans.iter().map(|scan| RegistrationFrame {
+                sensor: scan.sensor,
+                at: self.at,
+                delay_s: scan.delay_s,
+                has_jumped: scan.has_jumped,
+                samples: Vec::with_capacity(scan.detections.len()),
+            }));
+        let looks = self.looks(&scans, &hypotheses);
+        for hypothesis in &hypotheses {
+            if let Some(track) = hypothesis.track.filter(|_| !hypothesis.hits.is_empty()) {
+                self.sample(track, hypothesis, &scans, &mut outcome.frames);
+                self.update_track(track, hypothesis, &scans);
+            }
         }
-        self.outcome
-    }
-
-    /// Whether the report changes tracks. A proven liar's statements are judged and have no other effect.
-    fn is_trusted(&self) -> bool {
-        self.trust > 0.0
+        self.weigh(&looks, &scans, &mut outcome.evidence);
+        for scan in &scans {
+            self.look_at_foreign(scan);
+        }
+        for hypothesis in &hypotheses {
+            if hypothesis.track.is_none() && !hypothesis.hits.is_empty() {
+                self.spawn(hypothesis, &scans);
+            }
+        }
+        outcome
     }
 
     /// Updates or spawns the track of the vehicle itself from its pose; no other report may do so.
-    fn update_own_track(&mut self) {
-        let Some(pose) = self
-            .report
-            .pose
-            .filter(|_| self.report.moving != Some(false))
-        else {
+    fn update_own_track(&mut self, vehicle: SensorId, report: &ObjectReport) {
+        let Some(pose) = report.pose.filter(|_| report.moving != Some(false)) else {
+            return;
+        };
+        let Some(sensor) = self.sensors.get(vehicle) else {
             return;
         };
         let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
         let measurement = Measurement {
-            position: self.sensor.pose_bias.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
+            position: sensor.pose_bias.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
             independent: Matrix2::identity() * (sigma_m * sigma_m),
             common_m: self.config.common_m,
         };
-        let (density, vehicle, at) = (self.config.density(), self.sensor.id, self.at);
+        let at = self.at;
         let known = self.tracks.of_vehicle(vehicle);
         let is_in_reach = known.is_some_and(|track| {
-            let innovation = self.tracks[track]
-                .state
-                .innovation(at, &measurement, density);
+            let innovation = self.tracks[track].state.innovation(at, &measurement);
             innovation.offset.norm() <= self.config.gate_m
                 || innovation.distance_squared <= self.config.gate()
         });
         let begin = |update: &mut Self| {
-            let track = update.begin(&measurement, usize::MAX, None);
+            let track = update.begin(&measurement, report, usize::MAX, None);
             update.tracks.add(track)
         };
         let Some(index) = known.or_else(|| begin(self)) else {
             return;
         };
         self.tracks.set_vehicle(index, vehicle);
+        let leaving_hz = self.population.leaving_hz();
+        let class = ObjectClass::of(&self.config.vehicle_label, self.config);
         let track = &mut self.tracks[index];
         if is_in_reach {
-            track.state.update(at, &measurement, density);
-            track.state.limit_speed(self.config.max_speed_mps);
+            track.state.update(at, &measurement);
+            track.state.limit_speed();
         } else if at >= track.state.at {
             // The vehicle is new or has jumped; no other vehicle can have seen it here before.
-            track.state = KinematicState::new(at, &measurement, self.config.speed_mps);
+            track.state = KinematicState::new(at, &measurement, class);
             track.history.clear();
         }
         track.record_hit(at);
+        track.predict_existence(at, leaving_hz);
+        track.existence.raise(OWN_NATS);
         if let Some(history) = track.history.for_hit(vehicle, at) {
-            history.hit(at, measurement.position, OWN_NATS, Some(LookRates::PRIOR));
+            history.hit(at, measurement.position, OWN_NATS, OWN_NATS);
         }
+        track.note_detected(at);
         self.tracks.note_speed(index);
     }
 
-    /// The report's detections, but for those of the vehicle itself.
-    fn detections(&self) -> Vec<TimedDetection<'a>> {
-        let own = self
-            .report
-            .pose
-            .map(|pose| Vector2::new(pose.x_m, pose.y_m));
-        let trust = self.trust.max(MIN_TRUST);
-        let correct = self.sensor.pose_bias.corrector();
-        let detection = |(index, object): (usize, &'a PerceivedObject)| {
-            let reported = Vector2::new(object.x_m, object.y_m);
-            let is_itself =
-                own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
-            let measurement = Measurement {
-                position: correct(&reported),
-                independent: self.sensor.noise.covariance(object, self.config) / trust,
-                common_m: self.config.common_m,
+    /// All looks of the instant: detections, and misses of the tracks in view.
+    fn looks(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<Look> {
+        let mut detected: Vec<Vec<TrackIndex>> = vec![Vec::new(); scans.len()];
+        let mut looks = Vec::new();
+        for hypothesis in hypotheses {
+            let Some(track) = hypothesis.track else {
+                continue;
             };
-            let log_odds = log_odds(object.confidence);
-            (!is_itself).then_some(TimedDetection {
-                index,
-                object,
-                log_odds,
-                reported,
-                measurement,
-            })
-        };
-        let mut detections = Vec::with_capacity(self.report.objects.len());
-        detections.extend(self.report.objects.iter().enumerate().filter_map(detection));
-        detections
+            for (number, detection) in hypothesis.hits.iter().copied() {
+                let scan = &scans[number];
+                detected[number].push(track);
+                let history = &self.tracks[track].history;
+                let Some(sensor) = self.sensors.get(scan.sensor) else {
+                    continue;
+                };
+                let place = scan.detections[detection].reported;
+                let state = history
+                    .get(scan.sensor)
+                    .map_or(LookState::First, |history| history.state);
+                looks.push(Look {
+                    track,
+                    scan: number,
+                    detection: Some(detection),
+                    place,
+                    rates: sensor.hit_rates(&place, state),
+                    state,
+                    is_in_view: sensor.coverage.rates_at(&place).is_some(),
+                    is_hidden: false,
+                });
+            }
+        }
+        for (number, (scan, detected)) in scans.iter().zip(&mut detected).enumerate() {
+            detected.sort_unstable();
+            self.misses(number, scan, detected, &mut looks);
+        }
+        looks
     }
 
-    /// Updates a track with its detection, and the sensor model with what the track tells of it.
-    fn update_track(&mut self, index: TrackIndex, detection: &TimedDetection<'_>) {
-        let (id, at, density) = (self.sensor.id, self.at, self.config.density());
-        let TimedDetection {
-            object,
-            reported,
-            measurement,
-            ..
-        } = detection;
-        let track = &mut self.tracks[index];
-        let is_vehicle = track.vehicle.is_some();
-        if track.hits >= MATURE_HITS && !is_vehicle {
-            let offset = measurement.position - track.state.position_at(at);
-            let expected = track.state.covariance_at(at, density).trace();
-            self.sensor
-                .noise
-                .learn(object, offset.norm_squared(), expected, self.config);
-        }
-        if track.hits >= ESTABLISHED_HITS && !is_vehicle {
-            let variance = measurement.independent.trace() / 2.0;
-            self.outcome.samples.push(RegistrationSample {
-                track: index,
-                reported: *reported,
-                variance,
-            });
-        }
-        let rates = self
-            .sensor
-            .coverage
-            .rates_at(reported)
-            .filter(|_| !self.occlusion.hides(reported));
-        let look_rates = self
-            .sensor
-            .look_rates(rates.unwrap_or(DetectionRates::PRIOR));
-        let history = track.history.get(id);
-        if let (Some(history), Some(probability)) = (history, track.clutter) {
-            self.sensor
-                .clutter
-                .learn(probability, history.was_hit, true);
-        }
-        let has_room = history.is_some() || track.history.has_room(id, at);
-        let last_hit = history
-            .filter(|history| history.was_hit)
-            .map(|history| history.confidence_log_odds);
-        let was_hit = last_hit.is_some();
-        let exists = track.hits >= ESTABLISHED_HITS && (was_hit || track.is_confirmed(id, at));
-        if rates.is_some() && exists && has_room {
-            self.sensor.coverage.learn(reported, was_hit, true);
-        }
-        if self.trust > 0.0 {
-            track.state.update(at, measurement, density);
-            detection.describe(track, self.sensor, at, self.config);
-        }
-        if let Some(log_odds) = last_hit {
-            self.sensor.calibration.learn(log_odds, true);
-        }
-        let nats = self.sensor.calibration.nats(detection.log_odds);
-        let slot = if self.trust > 0.0 {
-            track.history.for_hit(id, at)
-        } else {
-            track.history.for_look(id, at)
+    /// Adds a miss of every track in the vehicle's view that is not among the `detected`.
+    fn misses(
+        &self,
+        number: usize,
+        scan: &Scan<'_>,
+        detected: &[TrackIndex],
+        looks: &mut Vec<Look>,
+    ) {
+        let Some(sensor) = self.sensors.get(scan.sensor) else {
+            return;
         };
-        let due = slot.and_then(|history| {
-            history.hit(at, measurement.position, nats, Some(look_rates));
-            history.confidence_log_odds = detection.log_odds;
-            history.take_due(at)
-        });
-        self.tracks.note_speed(index);
-        if let Some(statement) = due {
-            self.judge(index, reported, statement);
-        }
-    }
-
-    /// Counts a miss for every track in the vehicle's view that is not among the `detected`.
-    fn count_misses(&mut self, detected: &[TrackIndex]) {
-        let (id, at) = (self.sensor.id, self.at);
-        let Some(centre) = self.sensor.coverage.centre() else {
+        let Some(centre) = sensor.coverage.centre() else {
             return;
         };
         // Positions are those of the index, so that updates of the same round make no difference.
-        let since_indexed_s = self.tracks.seconds_since_indexed(at);
-        let mut in_view = Vec::new();
-        let reach_m = self.sensor.coverage.range_m() + self.tracks.slack_m(at);
+        let since_indexed_s = self.tracks.seconds_since_indexed(self.at);
+        let reach_m = sensor.coverage.range_m() + self.tracks.slack_m(self.at);
         self.tracks.near(&centre, reach_m, |indexed| {
-            let position = indexed.position + indexed.velocity * since_indexed_s;
-            if detected.binary_search(&indexed.track).is_err()
-                && let Some(rates) = self
-                    .sensor
-                    .coverage
-                    .rates_at(&position)
-                    .filter(|_| !self.occlusion.hides(&position))
-            {
-                in_view.push((indexed.track, position, rates));
+            if detected.binary_search(&indexed.track).is_ok() {
+                return;
             }
-        });
-        for (index, position, rates) in in_view {
-            let track = &mut self.tracks[index];
-            let has_jumped = (track.state.position_at(at) - position).norm() > self.config.gate_m;
-            if track.vehicle == Some(id) || has_jumped {
-                continue;
+            let place = indexed.position + indexed.velocity * since_indexed_s;
+            let track = &self.tracks[indexed.track];
+            let history = track.history.get(scan.sensor);
+            let state = history.map_or(LookState::First, |history| history.state);
+            let Some(rates) = sensor.look_rates(&place, state) else {
+                return;
+            };
+            let has_jumped = (track.state.position_at(self.at) - place).norm() > self.config.gate_m;
+            let is_stale = history.is_some_and(|history| history.last_look >= self.at);
+            let has_room = history.is_some() || track.history.has_room(scan.sensor, self.at);
+            if track.vehicle == Some(scan.sensor) || has_jumped || is_stale || !has_room {
+                return;
             }
-            let history = track.history.get(id);
-            if history.map_or(!track.history.has_room(id, at), |history| {
-                history.last_look >= at
-            }) {
-                continue;
-            }
-            let was_hit = history.is_some_and(|history| history.was_hit);
-            let look_rates = self.sensor.look_rates(rates);
-            if let (Some(_), Some(probability)) = (history, track.clutter) {
-                self.sensor.clutter.learn(probability, was_hit, false);
-            }
-            if let Some(history) = history.filter(|history| history.was_hit) {
-                self.sensor
-                    .calibration
-                    .learn(history.confidence_log_odds, false);
-            }
-            let had_detected = history.is_some_and(|history| history.last_hit.is_some());
-            let dt_s = history.map_or(0.0, |history| at.since(history.last_look).as_secs_f64());
-            if track.hits >= ESTABLISHED_HITS && (was_hit || track.is_confirmed(id, at)) {
-                self.sensor.coverage.learn(&position, was_hit, false);
-            }
-            let due = track.history.for_look(id, at).and_then(|history| {
-                history.miss(at, look_rates);
-                history.take_due(at)
+            looks.push(Look {
+                track: indexed.track,
+                scan: number,
+                detection: None,
+                place,
+                rates,
+                state,
+                is_in_view: true,
+                is_hidden: scan.occlusion.hides(&place),
             });
-            if had_detected && self.trust > 0.0 {
-                track.record_miss(at, dt_s, rates.after(was_hit));
-            }
-            if let Some(statement) = due {
-                self.judge(index, &position, statement);
-            }
+        });
+    }
+
+    /// Takes samples for registration from the detections of a confirmed track.
+    fn sample(
+        &self,
+        index: TrackIndex,
+        hypothesis: &Hypothesis,
+        scans: &[Scan<'_>],
+        frames: &mut [RegistrationFrame],
+    ) {
+        let track = &self.tracks[index];
+        if !track.is_confirmed() || track.vehicle.is_some() {
+            return;
+        }
+        for (scan, detection) in hypothesis.hits.iter().copied() {
+            let detection = &scans[scan].detections[detection];
+            frames[scan].samples.push(RegistrationSample {
+                track: index,
+                reported: detection.reported,
+                variance: detection.measurement.independent.trace() / 2.0,
+            });
         }
     }
 
-    /// Takes note of what the vehicle sees where cells state that objects are, and judges those cells.
-    fn look_at_foreign(&mut self, detections: &[TimedDetection<'_>]) {
-        let (id, at, gate) = (self.sensor.id, self.at, self.config.gate());
-        let Some(centre) = self
-            .sensor
-            .coverage
-            .centre()
-            .filter(|_| !self.foreign.is_empty())
-        else {
+    /// Updates a track once with all its detections, and learns the noise of the vehicles from the residuals.
+    fn update_track(&mut self, index: TrackIndex, hypothesis: &Hypothesis, scans: &[Scan<'_>]) {
+        let at = self.at;
+        let hits = || {
+            hypothesis
+                .hits
+                .iter()
+                .map(|(scan, detection)| (&scans[*scan], &scans[*scan].detections[*detection]))
+        };
+        let track = &mut self.tracks[index];
+        let Some((position, independent)) = hypothesis.detected() else {
             return;
         };
-        let (coverage, occlusion) = (&self.sensor.coverage, &self.occlusion);
-        let (reach_m, near_m) = (coverage.range_m(), 2.0 * self.config.gate_m);
-        let rates_at =
-            |place: &Vector2<f64>| coverage.rates_at(place).filter(|_| !occlusion.hides(place));
-        // Objects that nobody can see take no place from others.
-        let is_looked_at = |place: &Vector2<f64>| {
-            let is_within = (place - centre).norm() <= reach_m;
-            let mut places = detections
-                .iter()
-                .map(|detection| detection.measurement.position);
-            is_within
-                && (rates_at(place).is_some()
-                    || places.any(|other| (other - place).norm() <= near_m))
+        let measurement = Measurement {
+            position,
+            independent,
+            common_m: track.state.class.common_m,
         };
-        for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
-            let position = foreign.state.position_at(at);
-            let rates = rates_at(&position);
-            let near = detections.iter().filter(|detection| {
-                let innovation =
-                    foreign
-                        .state
-                        .innovation(at, &detection.measurement, self.config.density());
-                // Its place is as old as its cell's map.
-                innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
-            });
-            let likeliest = near
-                .map(|detection| detection.log_odds)
-                .max_by(f64::total_cmp);
-            match (likeliest, rates) {
-                (Some(log_odds), rates) => {
-                    let rates = self
-                        .sensor
-                        .look_rates(rates.unwrap_or(DetectionRates::PRIOR));
-                    if let Some(history) = foreign.history.for_hit(id, at) {
-                        history.hit(
-                            at,
-                            position,
-                            self.sensor.calibration.nats(log_odds),
-                            Some(rates),
-                        );
-                    }
-                }
-                (None, Some(rates)) => {
-                    let rates = self.sensor.look_rates(rates);
-                    if let Some(history) = foreign.history.for_look(id, at) {
-                        history.miss(at, rates);
-                    }
-                }
-                (None, None) => {}
+        let is_known = track.is_confirmed()
+            && track.vehicle.is_none()
+            && track.existence.probability() > CERTAIN;
+        let predicted = track.state.covariance_at(at).trace() / 2.0;
+        let alone = hypothesis.hits.len() == 1;
+        let alone_offset = position - track.state.position_at(at);
+        let innovation = track.state.innovation(at, &measurement);
+        if innovation.distance_squared > MANOEUVRE {
+            track.state.adapt(innovation.distance_squared / MANOEUVRE);
+        }
+        track.state.update(at, &measurement);
+        for (scan, detection) in hits() {
+            if let Some(sensor) = self.sensors.get(scan.sensor).filter(|_| scan.is_trusted()) {
+                describe(track, detection, sensor, at);
             }
         }
-        self.foreign.judge(self.fleet, at);
+        if track.vehicle.is_none() {
+            track.state.class = ObjectClass::of(&track.label(self.config), self.config);
+        }
+        track.state.limit_speed();
+        track.record_hit(at);
+        if is_known {
+            let estimated = track.state.covariance_at(at).trace() / 2.0;
+            let here = track.state.position_at(at);
+            for (scan, detection) in hits() {
+                if alone && track.history.len() > 1 {
+                    continue;
+                }
+                let residual = if alone {
+                    Residual {
+                        offset: alone_offset,
+                        variance: -predicted,
+                    }
+                } else {
+                    Residual {
+                        offset: detection.measurement.position - here,
+                        variance: estimated,
+                    }
+                };
+                if let Some(sensor) = self.sensors.get_mut(scan.sensor) {
+                    let origin = sensor.coverage.position();
+                    sensor
+                        .noise
+                        .learn(detection.object, origin.as_ref(), &residual, self.config);
+                }
+            }
+        }
+        self.tracks.note_speed(index);
     }
 
-    /// Judges the vehicle's statement about a track by the evidence of the others.
-    fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: ExistenceStatement) {
-        let track = &self.tracks[index];
-        let distance_m = self
-            .sensor
+    /// Weighs all looks in the existences, then learns from them.
+    fn weigh(&mut self, looks: &[Look], scans: &[Scan<'_>], evidence: &mut Vec<Evidence>) {
+        let (at, leaving_hz) = (self.at, self.population.leaving_hz());
+        let mut due = Vec::new();
+        for (number, look) in looks.iter().enumerate() {
+            let scan = &scans[look.scan];
+            let track = &mut self.tracks[look.track];
+            track.predict_existence(at, leaving_hz);
+            let nats = look.rates.nats(look.detection.is_some());
+            if look.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
+                track.existence.revive();
+            }
+            track.existence.add(scan.trust * nats);
+            let statement = match look.detection.map(|number| &scan.detections[number]) {
+                Some(detection) => {
+                    let slot = if scan.is_trusted() {
+                        track.history.for_hit(scan.sensor, at)
+                    } else {
+                        track.history.for_look(scan.sensor, at)
+                    };
+                    slot.and_then(|history| {
+                        let position = detection.measurement.position;
+                        history.hit(at, position, nats, detection.confidence_nats);
+                        history.take_due(at)
+                    })
+                }
+                None => track.history.for_look(scan.sensor, at).and_then(|history| {
+                    history.miss(at, &look.rates);
+                    if !look.is_hidden {
+                        history.state_miss();
+                    }
+                    history.take_due(at)
+                }),
+            };
+            due.extend(statement.map(|statement| (number, statement)));
+        }
+        let mut seen: Vec<TrackIndex> = looks.iter().map(|look| look.track).collect();
+        seen.sort_unstable();
+        seen.dedup();
+        for track in seen {
+            self.tracks[track].note_detected(at);
+        }
+        for look in looks {
+            self.learn(look, &scans[look.scan]);
+        }
+        for (number, statement) in due {
+            let look = &looks[number];
+            self.judge(look, scans[look.scan].sensor, statement, evidence);
+        }
+    }
+
+    /// Learns rates and calibration from a look, by the existence after all looks of the instant.
+    fn learn(&mut self, look: &Look, scan: &Scan<'_>) {
+        let track = &mut self.tracks[look.track];
+        if track.vehicle.is_some() {
+            return;
+        }
+        let exists = track.existence.probability();
+        if track.is_confirmed() && exists > CERTAIN && !track.is_settled {
+            track.is_settled = true;
+            self.population.settle(true);
+        }
+        let is_hit = look.detection.is_some();
+        let is_evident = track.is_confirmed()
+            && look.is_in_view
+            && (look.state.is_hit() || track.is_seen_by_others(scan.sensor, self.at));
+        let Some(sensor) = self.sensors.get_mut(scan.sensor) else {
+            return;
+        };
+        if is_evident {
+            sensor
+                .coverage
+                .learn(&look.place, look.state, is_hit, exists);
+        }
+        sensor.clutter.learn(look.state, is_hit, 1.0 - exists);
+        if let Some(detection) = look.detection.map(|number| &scan.detections[number]) {
+            sensor.calibration.learn(detection.log_odds, exists);
+        }
+    }
+
+    /// Judges a vehicle's statement about a track by the evidence of the others.
+    fn judge(
+        &mut self,
+        look: &Look,
+        vehicle: SensorId,
+        statement: ExistenceStatement,
+        evidence: &mut Vec<Evidence>,
+    ) {
+        let track = &self.tracks[look.track];
+        let label = track.label(self.config);
+        let (sensor, fleet) = match self.sensors.with_fleet(vehicle) {
+            Some(both) => both,
+            None => return,
+        };
+        let distance_m = sensor
             .coverage
             .centre()
-            .map_or(0.0, |centre| (reported - centre).norm());
-        let judgement = self.fleet.judge(
-            self.sensor.id,
-            statement,
-            &track.history,
-            distance_m,
-            self.at,
-        );
+            .map_or(0.0, |centre| (look.place - centre).norm());
+        let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
         let Some(judgement) = judgement else { return };
         let correct = judgement == Judgement::Correct;
-        self.fleet
-            .count(self.sensor.id, &mut self.sensor.counts, correct);
-        let label = track.label(self.config);
-        self.outcome.evidence.push(Evidence {
-            node: self.sensor.node.clone(),
+        fleet.count(vehicle, &mut sensor.counts, correct);
+        evidence.push(Evidence {
+            node: sensor.node.clone(),
             label,
             correct,
         });
     }
 
-    /// A new track at a measurement of object `index` of the report: an object of a neighbouring cell, if one is there.
+    /// Takes note of what a vehicle sees where cells state that objects are, and judges those cells.
+    fn look_at_foreign(&mut self, scan: &Scan<'_>) {
+        let (id, at, gate) = (scan.sensor, self.at, self.config.gate());
+        let Some(sensor) = self.sensors.get(id).filter(|_| !self.foreign.is_empty()) else {
+            return;
+        };
+        let Some(centre) = sensor.coverage.centre() else {
+            return;
+        };
+        let (reach_m, near_m) = (sensor.coverage.range_m(), 2.0 * self.config.gate_m);
+        let is_in_view = |place: &Vector2<f64>| sensor.coverage.rates_at(place).is_some();
+        // Objects that nobody can see take no place from others.
+        let is_looked_at = |place: &Vector2<f64>| {
+            let is_within = (place - centre).norm() <= reach_m;
+            let mut places = scan
+                .detections
+                .iter()
+                .map(|detection| detection.measurement.position);
+            is_within && (is_in_view(place) || places.any(|other| (other - place).norm() <= near_m))
+        };
+        for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
+            let position = foreign.state.position_at(at);
+            let state = foreign
+                .history
+                .get(id)
+                .map_or(LookState::First, |history| history.state);
+            let near = scan.detections.iter().filter(|detection| {
+                let innovation = foreign.state.innovation(at, &detection.measurement);
+                // Its place is as old as its cell's map.
+                innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
+            });
+            let confidence = near
+                .map(|detection| detection.confidence_nats)
+                .max_by(f64::total_cmp);
+            if let Some(confidence) = confidence {
+                let nats = sensor.hit_rates(&position, state).nats(true);
+                if let Some(history) = foreign.history.for_hit(id, at) {
+                    history.hit(at, position, nats, confidence);
+                }
+            } else if let Some(rates) = sensor.look_rates(&position, state)
+                && let Some(history) = foreign.history.for_look(id, at)
+            {
+                history.miss(at, &rates);
+            }
+        }
+        self.foreign.judge(&self.sensors.fleet, at);
+    }
+
+    /// A new track at a measurement of object `index` of a report: an object of a neighbouring cell, if one is there.
     fn begin(
         &mut self,
         measurement: &Measurement,
+        report: &ObjectReport,
         index: usize,
         detected: Option<&PerceivedObject>,
     ) -> Track {
         let (at, config) = (self.at, self.config);
+        let fleet = &self.sensors.fleet;
         match self
             .foreign
-            .find(at, measurement, detected, self.tracks, self.fleet, config)
+            .find(at, measurement, detected, self.tracks, fleet, config)
         {
             Some(foreign) => {
                 let track = foreign.lend(at, measurement, config);
                 self.foreign.hand_overs.begun += 1;
                 track
             }
-            None => Track::new(track_id(self.report, index), at, measurement, config),
+            None => {
+                let label = detected.map_or(&config.vehicle_label, |object| &object.label);
+                let class = ObjectClass::of(label, config);
+                Track::new(track_id(report, index), at, measurement, class)
+            }
         }
     }
 
-    /// Spawns a track from a detection that no track explains.
-    fn spawn(&mut self, detection: &TimedDetection<'_>) {
+    /// Spawns a track from detections that no track explains.
+    fn spawn(&mut self, hypothesis: &Hypothesis, scans: &[Scan<'_>]) {
         let at = self.at;
-        let mut track = self.begin(
-            &detection.measurement,
-            detection.index,
-            Some(detection.object),
-        );
-        detection.describe(&mut track, self.sensor, at, self.config);
-        let nats = self.sensor.calibration.nats(detection.log_odds);
-        if let Some(history) = track.history.for_hit(self.sensor.id, at) {
-            history.hit(at, detection.measurement.position, nats, None);
-            history.confidence_log_odds = detection.log_odds;
+        let hits = || {
+            hypothesis
+                .hits
+                .iter()
+                .map(|(scan, detection)| (&scans[*scan], &scans[*scan].detections[*detection]))
+                .filter(|(scan, _)| scan.is_trusted())
+        };
+        let Some((first, detection)) = hits().next() else {
+            return;
+        };
+        let Some((position, independent)) = hypothesis.detected() else {
+            return;
+        };
+        let measurement = Measurement {
+            position,
+            independent,
+            common_m: detection.class.common_m,
+        };
+        let object = Some(detection.object);
+        let mut track = self.begin(&measurement, first.report, detection.index, object);
+        let mut log_odds = self.population.birth_log_odds();
+        for (number, (scan, detection)) in hits().enumerate() {
+            let Some(sensor) = self.sensors.get(scan.sensor) else {
+                continue;
+            };
+            let nats = if number == 0 {
+                0.0
+            } else {
+                let rates = sensor.hit_rates(&detection.reported, LookState::First);
+                rates.nats(true)
+            };
+            log_odds += scan.trust * nats;
+            describe(&mut track, detection, sensor, at);
+            if let Some(history) = track.history.for_hit(scan.sensor, at) {
+                history.hit(at, position, nats, detection.confidence_nats);
+                history.position = detection.measurement.position;
+            }
         }
+        for scan in scans {
+            if hits().any(|(other, _)| other.sensor == scan.sensor) {
+                continue;
+            }
+            let Some(sensor) = self.sensors.get(scan.sensor) else {
+                continue;
+            };
+            let rates = sensor.look_rates(&position, LookState::First);
+            if let Some(rates) = rates {
+                let nats = rates.nats(false);
+                log_odds += scan.trust * nats;
+                if let Some(history) = track.history.for_look(scan.sensor, at) {
+                    history.miss(at, &rates);
+                }
+            }
+        }
+        track.record_hit(at);
+        let trust = hits().map(|(scan, _)| scan.trust).fold(0.0, f64::max);
+        track.existence.raise(log_odds + trust.ln());
         self.tracks.add(track);
     }
 }
 
-impl TimedDetection<'_> {
-    /// Updates velocity, attributes and time of a track.
-    fn describe(
-        &self,
-        track: &mut Track,
-        sensor: &SensorModel,
-        at: Timestamp,
-        config: &TracksConfig,
-    ) {
-        if let Some([x, y]) = self.object.velocity_mps {
-            let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
-            track
-                .state
-                .update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
-        }
-        track.state.limit_speed(config.max_speed_mps);
-        let heading_rad = self
-            .object
-            .heading_rad
-            .map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
-        track.update_attributes(self.object, heading_rad);
-        track.record_hit(at);
+/// Updates velocity and attributes of a track by one detection.
+fn describe(
+    track: &mut Track,
+    detection: &ScannedDetection<'_>,
+    sensor: &SensorModel,
+    at: Timestamp,
+) {
+    let object = detection.object;
+    if let Some([x, y]) = object.velocity_mps {
+        let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
+        track
+            .state
+            .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
     }
+    let heading_rad = object
+        .heading_rad
+        .map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
+    track.update_attributes(object, heading_rad);
 }

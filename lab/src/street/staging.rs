@@ -3,8 +3,8 @@
 //!
 //! ```text
 //!   houses ==================================================
-//!   pavement      o ->   <- o        o              [galileo <
-//!   parked       [ van ] [ van ] [ van ]
+//!   pavement      o ->   <- o        o              [ car ]
+//!   parked       [ van ] [ van ]     [galileo <]
 //!   road     ( <- - - - - - - gauss - - - - - car - - - - )
 //!            ( - - - euclid - - - - - - - - - - - - - - -> )
 //!   pavement  mast (kepler)   o ->   [kiosk]   <- o
@@ -49,7 +49,7 @@ impl Default for Street {
             driving(22.0, [70.0, 60.0, 200.0]),
             parked(-7.0, [200.0, 200.0, 205.0]),
             parked(-1.0, [120.0, 110.0, 70.0]),
-            parked(5.0, [60.0, 60.0, 65.0]),
+            van(Route::stands(5.0, 4.9, 180.0), [60.0, 60.0, 65.0]),
             // Behind the vans.
             person(
                 walk(&[[-5.0, 6.7], [5.5, 6.7], [5.5, 7.6], [-5.0, 7.6]], 4.0),
@@ -126,7 +126,7 @@ impl Default for Street {
             cameras: vec![
                 on_car("euclid", 0),
                 on_car("gauss", 1),
-                on_car("galileo", 2),
+                on_car("galileo", 6),
                 mast,
             ],
         }

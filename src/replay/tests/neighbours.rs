@@ -175,7 +175,7 @@ fn a_journal_gives_the_same_maps_with_what_neighbours_see_and_say_and_objects_th
             .fold(0.0, f64::max)
     };
     assert!(
-        existence(2600) < existence(2400) - 0.02,
+        existence(2600) < existence(2400) - 0.002,
         "{} {}",
         existence(2400),
         existence(2600)

@@ -4,8 +4,8 @@ use super::*;
 use crate::tracking::trust::TrustCounts;
 
 /// `euclid` sees a car all the time. Twenty others are elsewhere, apart from half a second each, one after the other, if
-/// they pass it. Returns the log-odds that the car exists 20 s after the last of these times.
-fn log_odds_of_a_car(is_passed: bool) -> f64 {
+/// they pass it. Returns the probability that the car exists 20 s after the last of these times.
+fn existence_of_a_car(is_passed: bool) -> f64 {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..300 {
@@ -24,22 +24,21 @@ fn log_odds_of_a_car(is_passed: bool) -> f64 {
         }
         round = tracker.close(at(frame));
     }
-    let existence = round
+    round
         .objects
         .iter()
         .find(|object| near(object, 0.0, 0.0, 1.0))
         .unwrap()
         .existence
-        .unwrap();
-    (existence / (1.0 - existence)).ln()
+        .unwrap()
 }
 
 #[test]
 fn whoever_has_passed_an_object_looks_at_it_no_more() {
-    let [passed, alone] = [true, false].map(log_odds_of_a_car);
+    let [passed, alone] = [true, false].map(existence_of_a_car);
     assert!(
-        (passed - alone).abs() < 0.2,
-        "log-odds are {passed} after twenty have passed, {alone} if nobody has"
+        (passed - alone).abs() < 0.001,
+        "existence is {passed} after twenty have passed, {alone} if nobody has"
     );
 }
 
@@ -128,8 +127,21 @@ fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..100 {
-        tracker.observe(report("b", frame, vec![car(-0.5, 0.0)]), at(frame));
-        tracker.observe(report("c", frame, vec![car(0.5, 0.0)]), at(frame));
+        for (node, x_m) in [("b", -0.5), ("c", 0.5)] {
+            let pose = Some(WirePose::new(x_m, -20.0, std::f64::consts::FRAC_PI_2));
+            let view = Some(FieldOfView {
+                range_m: 60.0,
+                angle_rad: 1.0,
+            });
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    view,
+                    ..report(node, frame, vec![car(x_m, 0.0)])
+                },
+                at(frame),
+            );
+        }
         let seen = if frame < 5 {
             vec![car(-0.5, 0.0), car(0.5, 0.0)]
         } else {

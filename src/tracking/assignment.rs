@@ -1,0 +1,404 @@
+//! Joint association of all scans of one instant.
+//!
+//! Every track is a hypothesis in information form: Y = P⁻¹ and y = Y·x of its predicted position. The vehicles are
+//! assigned one after the other by global nearest neighbour (Blackman, Popoli, "Design and Analysis of Modern Tracking
+//! Systems", 1999, chapter 6). The information of each assigned detection is added, so that the next vehicle is compared
+//! with the prediction and the others' detections. A second pass takes out a vehicle's own detections first and assigns it
+//! again: iterated conditional modes of the multi-sensor assignment (Besag, "On the statistical analysis of dirty
+//! pictures", 1986). Detections that no hypothesis explains open a new one, which the following vehicles may join.
+//!
+//! The benefit of a pair is its log-likelihood ratio to a detection of clutter or of a new object (Bar-Shalom, Li,
+//! "Multitarget-Multisensor Tracking", 1995, section 2.4).
+
+use std::f64::consts::TAU;
+use std::time::Duration;
+
+use hashbrown::{HashMap, HashSet};
+use nalgebra::{Matrix2, Vector2};
+use smallvec::SmallVec;
+
+use super::config::TracksConfig;
+use super::existence::LookState;
+use super::handles::TrackIndex;
+use super::kinematics::inverse;
+use super::scan::{Scan, ScannedDetection};
+use super::sensors::Sensors;
+use super::store::TrackStore;
+use super::track::{MIN_LABEL_SIMILARITY, Track};
+use crate::association::{Candidate, ClusterSize, assign};
+use crate::model::time::Timestamp;
+
+/// Passes over the scans of an instant, if there are several.
+const PASSES: usize = 2;
+
+/// Minimum probability that a track is detected: tracks of little existence must be able to recover.
+const MIN_DETECTED: f64 = 0.2;
+
+/// Probability that a hypothesis of this instant is an object.
+const NEW_EXISTENCE: f64 = 0.5;
+
+/// Number of detections in one cluster beyond which the best pairs are taken one after the other.
+const MAX_CLUSTER: usize = 48;
+
+/// Maximum age of a new track that may have any velocity.
+const FAST_WITHIN: Duration = Duration::from_millis(250);
+
+/// Maximum number of detections of a scan that are compared with such tracks. Where more are new, nothing is known yet,
+/// or a vehicle fabricates them.
+const MAX_FAST: usize = 64;
+
+/// Maximum number of new hypotheses within the gate of a detection that are compared with it.
+const MAX_NEW_NEAR: usize = 16;
+
+/// What may have caused detections of this instant.
+#[derive(Debug)]
+pub(super) struct Hypothesis {
+    /// The track; `None` for an object that begins here.
+    pub(super) track: Option<TrackIndex>,
+    /// Predicted information; zero for an object that begins here.
+    prior: Information,
+    information: Information,
+    /// Numbers of scans and their detections, by scan.
+    pub(super) hits: SmallVec<[(usize, usize); 4]>,
+}
+
+/// Gaussian estimate of a position in information form.
+#[derive(Debug, Clone, Copy)]
+struct Information {
+    matrix: Matrix2<f64>,
+    vector: Vector2<f64>,
+}
+
+impl Information {
+    const NONE: Self = Self {
+        matrix: Matrix2::new(0.0, 0.0, 0.0, 0.0),
+        vector: Vector2::new(0.0, 0.0),
+    };
+
+    fn of(position: &Vector2<f64>, covariance: &Matrix2<f64>) -> Self {
+        let matrix = inverse(covariance).unwrap_or_default();
+        Self {
+            matrix,
+            vector: matrix * position,
+        }
+    }
+
+    fn add(&mut self, other: &Self, sign: f64) {
+        self.matrix += other.matrix * sign;
+        self.vector += other.vector * sign;
+    }
+
+    fn mean(&self) -> Option<(Vector2<f64>, Matrix2<f64>)> {
+        let covariance = inverse(&self.matrix)?;
+        Some((covariance * self.vector, covariance))
+    }
+}
+
+impl Hypothesis {
+    /// Position and covariance of all its detections together.
+    pub(super) fn detected(&self) -> Option<(Vector2<f64>, Matrix2<f64>)> {
+        let mut detected = self.information;
+        detected.add(&self.prior, -1.0);
+        detected.mean()
+    }
+}
+
+/// A detection and a hypothesis within the gate.
+#[derive(Debug, Clone, Copy)]
+struct GatedPair {
+    detection: usize,
+    hypothesis: usize,
+    benefit: f64,
+}
+
+/// Association of one instant.
+pub(super) struct Assignment<'a> {
+    config: &'a TracksConfig,
+    tracks: &'a TrackStore,
+    sensors: &'a Sensors,
+    at: Timestamp,
+    hypotheses: Vec<Hypothesis>,
+    of_track: HashMap<TrackIndex, usize>,
+    /// Hypotheses of new objects by square of the gate's side.
+    new: HashMap<(i64, i64), SmallVec<[usize; 4]>>,
+}
+
+impl<'a> Assignment<'a> {
+    /// Assigns the detections of all scans.
+    pub(super) fn of(
+        scans: &[Scan<'_>],
+        tracks: &'a TrackStore,
+        sensors: &'a Sensors,
+        at: Timestamp,
+        config: &'a TracksConfig,
+    ) -> Vec<Hypothesis> {
+        let mut assignment = Self {
+            config,
+            tracks,
+            sensors,
+            at,
+            hypotheses: Vec::new(),
+            of_track: HashMap::new(),
+            new: HashMap::new(),
+        };
+        let mut owners: Vec<Vec<usize>> = vec![Vec::new(); scans.len()];
+        let passes = if scans.len() > 1 {
+            PASSES as f64 as usize
+        } else {
+            1
+        };
+        for _ in 0..passes {
+            for (scan, owners) in scans.iter().zip(&mut owners) {
+                assignment.assign(scan, owners);
+            }
+        }
+        for (number, owners) in owners.iter().enumerate() {
+            for (detection, owner) in owners.iter().enumerate() {
+                assignment.hypotheses[*owner].hits.push((number, detection));
+            }
+        }
+        assignment.hypotheses
+    }
+
+    /// Assigns one scan; `owners` are the hypotheses of its detections in the pass before, and afterwards those of this.
+    fn assign(&mut self, scan: &Scan<'_>, owners: &mut Vec<usize>) {
+        let information: Vec<Information> = scan
+            .detections
+            .iter()
+            .map(|detection| {
+                let measurement = &detection.measurement;
+                Information::of(&measurement.position, &measurement.independent)
+            })
+            .collect();
+        if scan.is_trusted() {
+            for (owner, information) in owners.iter().zip(&information) {
+                self.hypotheses[*owner].information.add(information, -1.0);
+            }
+        }
+        let pairs = self.gated_pairs(scan);
+        let mut assigned: Vec<Option<usize>> = vec![None; scan.detections.len()];
+        for pair in assign(pairs, greedy_if_large) {
+            assigned[pair.detection] = Some(pair.hypothesis);
+        }
+        self.assign_fast(scan, &mut assigned);
+        *owners = assigned
+            .iter()
+            .zip(&scan.detections)
+            .map(|(owner, detection)| owner.unwrap_or_else(|| self.open(detection)))
+            .collect();
+        if scan.is_trusted() {
+            for (owner, information) in owners.iter().zip(&information) {
+                self.hypotheses[*owner].information.add(information, 1.0);
+            }
+        }
+    }
+
+    /// Assigns remaining detections that are likely objects to tracks that are so new that they may have any velocity.
+    fn assign_fast(&mut self, scan: &Scan<'_>, assigned: &mut [Option<usize>]) {
+        let taken: HashSet<usize> = assigned.iter().flatten().copied().collect();
+        let mut pairs = Vec::new();
+        let likely = scan
+            .detections
+            .iter()
+            .enumerate()
+            .filter(|(number, detection)| {
+                assigned[*number].is_none() && detection.confidence_nats > 0.0
+            });
+        for (number, detection) in likely.take(MAX_FAST) {
+            let reach_m = detection.class.max_speed_mps * FAST_WITHIN.as_secs_f64();
+            let mut near: SmallVec<[TrackIndex; 4]> = SmallVec::new();
+            self.tracks.near(
+                &detection.measurement.position,
+                reach_m + self.tracks.slack_m(self.at),
+                |indexed| {
+                    if self.tracks[indexed.track].may_have_any_velocity() {
+                        near.push(indexed.track);
+                    }
+                },
+            );
+            for track in near {
+                let hypothesis = self.of_track(track);
+                if !taken.contains(&hypothesis)
+                    && let Some(benefit) = self.benefit_if_fast(&self.tracks[track], detection)
+                {
+                    pairs.push(GatedPair {
+                        detection: number,
+                        hypothesis,
+                        benefit,
+                    });
+                }
+            }
+        }
+        for pair in assign(pairs, greedy_if_large) {
+            assigned[pair.detection] = Some(pair.hypothesis);
+        }
+    }
+
+    /// Benefit of pairing a detection with a new track of any velocity; `None` if they cannot be the same object.
+    fn benefit_if_fast(&self, track: &Track, detection: &ScannedDetection<'_>) -> Option<f64> {
+        let passed = self.at.since(track.last_seen);
+        let offset = detection.measurement.position - track.state.position_at(self.at);
+        let max_mps = detection.class.max_speed_mps;
+        if passed > FAST_WITHIN || offset.norm() > max_mps * passed.as_secs_f64() {
+            return None;
+        }
+        let similarity = track.label_similarity(detection.object);
+        let mut state = track.state.clone();
+        state.inflate_velocity_covariance(max_mps / 2.0);
+        let distance_squared = state
+            .innovation(self.at, &detection.measurement)
+            .distance_squared;
+        let is_possible =
+            distance_squared <= self.config.gate() && similarity > MIN_LABEL_SIMILARITY;
+        is_possible.then(|| self.config.gate() - distance_squared + similarity.ln())
+    }
+
+    /// The hypothesis of a track.
+    fn of_track(&mut self, track: TrackIndex) -> usize {
+        let next = self.hypotheses.len();
+        let hypothesis = *self.of_track.entry(track).or_insert(next);
+        if hypothesis == next {
+            let state = &self.tracks[track].state;
+            let prior = Information::of(&state.position_at(self.at), &state.covariance_at(self.at));
+            self.hypotheses.push(Hypothesis {
+                track: Some(track),
+                prior,
+                information: prior,
+                hits: SmallVec::new(),
+            });
+        }
+        hypothesis
+    }
+
+    fn gated_pairs(&mut self, scan: &Scan<'_>) -> Vec<GatedPair> {
+        let reach_m = self.config.gate_m + self.tracks.slack_m(self.at);
+        let mut pairs = Vec::with_capacity(2 * scan.detections.len());
+        for (number, detection) in scan.detections.iter().enumerate() {
+            let mut tracks: SmallVec<[TrackIndex; 16]> = SmallVec::new();
+            self.tracks
+                .near(&detection.measurement.position, reach_m, |indexed| {
+                    if self.tracks[indexed.track].vehicle != Some(scan.sensor) {
+                        tracks.push(indexed.track);
+                    }
+                });
+            let mut near: SmallVec<[usize; 16]> = tracks
+                .into_iter()
+                .map(|track| self.of_track(track))
+                .collect();
+            self.new_near(&detection.measurement.position, &mut near);
+            for hypothesis in near {
+                if let Some(benefit) = self.benefit(scan, detection, &self.hypotheses[hypothesis]) {
+                    pairs.push(GatedPair {
+                        detection: number,
+                        hypothesis,
+                        benefit,
+                    });
+                }
+            }
+        }
+        pairs
+    }
+
+    /// Log-likelihood ratio of a pair, greater than 0; `None` if clutter or a new object explains the detection better.
+    fn benefit(
+        &self,
+        scan: &Scan<'_>,
+        detection: &ScannedDetection<'_>,
+        hypothesis: &Hypothesis,
+    ) -> Option<f64> {
+        let (position, covariance) = hypothesis.information.mean()?;
+        let measurement = &detection.measurement;
+        let offset = measurement.position - position;
+        if offset.norm_squared() > self.config.gate_m.powi(2) {
+            return None;
+        }
+        let common = Matrix2::identity() * measurement.common_m.powi(2);
+        let covariance = covariance + measurement.independent + common;
+        let distance_squared = offset.dot(&(inverse(&covariance)? * offset));
+        if distance_squared > self.config.gate() {
+            return None;
+        }
+        let sensor = self.sensors.get(scan.sensor)?;
+        let rates = sensor.coverage.rates_at(&detection.reported);
+        let rate = |state| rates.map_or(NEW_EXISTENCE, |rates| rates.rate(state));
+        let (detected, similarity) = match hypothesis.track.map(|track| &self.tracks[track]) {
+            Some(track) => {
+                let history = track.history.get(scan.sensor);
+                let state = history.map_or(LookState::First, |history| history.state);
+                (
+                    track.existence.probability() * rate(state),
+                    track.label_similarity(detection.object),
+                )
+            }
+            None => (NEW_EXISTENCE * rate(LookState::First), 1.0),
+        };
+        let odds = detected.max(MIN_DETECTED) / (1.0 - detected).max(0.02);
+        let new_per_m2 = detection.class.new_per_m2;
+        let density = TAU * covariance.determinant().sqrt() * new_per_m2;
+        let benefit = (odds * similarity.powf(1.0) / density).ln() - distance_squared / 2.0;
+        (benefit > 0.0).then_some(benefit)
+    }
+
+    /// A new hypothesis at a detection.
+    fn open(&mut self, detection: &ScannedDetection<'_>) -> usize {
+        let square = self.square(&detection.measurement.position);
+        let number = self.hypotheses.len();
+        self.hypotheses.push(Hypothesis {
+            track: None,
+            prior: Information::NONE,
+            information: Information::NONE,
+            hits: SmallVec::new(),
+        });
+        self.new.entry(square).or_default().push(number);
+        number
+    }
+
+    fn square(&self, position: &Vector2<f64>) -> (i64, i64) {
+        let line = |coordinate_m: f64| (coordinate_m / self.config.gate_m).floor() as i64;
+        (line(position.x), line(position.y))
+    }
+
+    fn new_near(&self, position: &Vector2<f64>, near: &mut SmallVec<[usize; 16]>) {
+        if self.new.is_empty() {
+            return;
+        }
+        let (column, row) = self.square(position);
+        for (dx, dy) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy))) {
+            if let Some(numbers) = self.new.get(&(column + dx, row + dy)) {
+                near.extend(numbers.iter().copied().take(MAX_NEW_NEAR));
+            }
+        }
+    }
+}
+
+/// Of a cluster that is too large, the pairs taken one after the other, the best first.
+fn greedy_if_large(size: ClusterSize, cluster: &[GatedPair]) -> Option<Vec<GatedPair>> {
+    (size.rows > MAX_CLUSTER).then(|| {
+        let mut by_benefit = cluster.to_vec();
+        by_benefit.sort_by(|a, b| b.benefit.total_cmp(&a.benefit));
+        let (mut detections, mut hypotheses) = (HashSet::new(), HashSet::new());
+        by_benefit.retain(|pair| {
+            let is_free =
+                !detections.contains(&pair.detection) && !hypotheses.contains(&pair.hypothesis);
+            is_free && detections.insert(pair.detection) && hypotheses.insert(pair.hypothesis)
+        });
+        by_benefit
+    })
+}
+
+impl Candidate for GatedPair {
+    const SPARE_COLUMNS: bool = true;
+
+    fn row(&self) -> u32 {
+        self.detection as u32
+    }
+
+    fn column(&self) -> u32 {
+        self.hypothesis as u32
+    }
+
+    /// The benefit in units of 2⁻³⁰, at least one unit.
+    fn benefit(&self) -> i64 {
+        (self.benefit.min(1e6) * f64::from(1u32 << 30)) as i64 + 1
+    }
+}

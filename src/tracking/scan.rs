@@ -1,0 +1,101 @@
+//! One report as a scan: the detections of one vehicle at one instant, corrected and with their errors.
+
+use nalgebra::Vector2;
+
+use super::calibration::log_odds;
+use super::class::ObjectClass;
+use super::config::TracksConfig;
+use super::handles::SensorId;
+use super::kinematics::Measurement;
+use super::occlusion::OcclusionMap;
+use super::sensors::SensorModel;
+use crate::wire::{ObjectReport, PerceivedObject};
+
+/// Minimum trust by which the covariances of positions are divided.
+const MIN_TRUST: f64 = 0.05;
+
+/// A detection of a report, corrected by the estimated pose bias.
+#[derive(Debug)]
+pub(super) struct ScannedDetection<'a> {
+    /// Index into the objects of the report.
+    pub(super) index: usize,
+    pub(super) object: &'a PerceivedObject,
+    pub(super) class: ObjectClass,
+    /// Log-odds of the confidence.
+    pub(super) log_odds: f64,
+    /// Evidence of the confidence by the vehicle's calibration, nats.
+    pub(super) confidence_nats: f64,
+    /// Position as reported, metres.
+    pub(super) reported: Vector2<f64>,
+    pub(super) measurement: Measurement,
+}
+
+/// The detections of one report.
+#[derive(Debug)]
+pub(super) struct Scan<'a> {
+    pub(super) sensor: SensorId,
+    pub(super) report: &'a ObjectReport,
+    /// Weight of the vehicle's evidence before the update, 0 to 1.
+    pub(super) trust: f64,
+    /// Correction of the report's stamp, seconds.
+    pub(super) delay_s: f64,
+    /// True if the vehicle has jumped to another place, so that its earlier samples are void.
+    pub(super) has_jumped: bool,
+    pub(super) detections: Vec<ScannedDetection<'a>>,
+    /// What the detections hide. It excuses misses; existences learn from the rates alone.
+    pub(super) occlusion: OcclusionMap,
+}
+
+impl<'a> Scan<'a> {
+    /// The scan of a report. Detections of the vehicle itself are left out.
+    pub(super) fn new(
+        sensor: &SensorModel,
+        report: &'a ObjectReport,
+        trust: f64,
+        config: &TracksConfig,
+    ) -> Self {
+        let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
+        let correct = sensor.pose_bias.corrector();
+        let mut occlusion = OcclusionMap::new(sensor.coverage.position());
+        let mut detections = Vec::with_capacity(report.objects.len());
+        for (index, object) in report.objects.iter().enumerate() {
+            let log_odds = log_odds(object.confidence);
+            let reported = Vector2::new(object.x_m, object.y_m);
+            if own.is_some_and(|own| (own - reported).norm() < config.vehicle_radius_m) {
+                continue;
+            }
+            if sensor.calibration.nats(log_odds) > 0.0 {
+                occlusion.add(object, config.vehicle_radius_m);
+            }
+            let class = ObjectClass::of(&object.label, config);
+            let covariance = sensor.noise.covariance(object, own.as_ref(), config);
+            detections.push(ScannedDetection {
+                index,
+                object,
+                class,
+                log_odds,
+                confidence_nats: sensor.calibration.nats(log_odds),
+                reported,
+                measurement: Measurement {
+                    position: correct(&reported),
+                    independent: covariance / trust.max(MIN_TRUST),
+                    common_m: class.common_m,
+                },
+            });
+        }
+        Self {
+            sensor: sensor.id,
+            report,
+            trust,
+            delay_s: 0.0,
+            has_jumped: false,
+            detections,
+            occlusion,
+        }
+    }
+
+    /// Whether the report changes tracks. The statements of a vehicle without trust are judged and have no other effect.
+    pub(super) fn is_trusted(&self) -> bool {
+        self.trust > 0.0
+    }
+}

@@ -1,0 +1,97 @@
+//! Twins: two tracks of one object.
+//!
+//! Two tracks that are near each other are two objects if a vehicle detects both in one frame. They are one if some
+//! vehicles detect only this one while others detect only that one: two objects would be detected together. The
+//! log-likelihood ratio of the two adds up look by look, a sequential probability ratio test (Wald, 1945).
+
+use std::time::Duration;
+
+use smallvec::SmallVec;
+use uuid::Uuid;
+
+use super::detection_history::DetectionHistory;
+use super::existence::SensorHistory;
+use crate::model::time::Timestamp;
+
+/// Log-odds from which two tracks are one object. Below their negative, further looks change nothing.
+const TWIN_NATS: f64 = 5.0;
+
+/// Probability that a detector reports one object twice in a frame.
+const DUPLICATE: f64 = 0.05;
+
+/// Time for which a pair is remembered after its tracks were near each other.
+const REMEMBERED: Duration = Duration::from_secs(3);
+
+/// Tracks near one track, and whether they are the same object.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Twins(SmallVec<[Twin; 1]>);
+
+#[derive(Debug, Clone)]
+struct Twin {
+    id: Uuid,
+    /// Log-odds that both are one object.
+    nats: f64,
+    /// Time of the latest looks that count.
+    at: Timestamp,
+}
+
+impl Twins {
+    /// Weighs the looks at both tracks since the last time. `rate` is a vehicle's probability of a detection of either.
+    pub(super) fn weigh(
+        &mut self,
+        own: &DetectionHistory,
+        other: &DetectionHistory,
+        other_id: Uuid,
+        now: Timestamp,
+        rate: impl Fn(&SensorHistory) -> f64,
+    ) {
+        self.0.retain(|twin| now.since(twin.at) <= REMEMBERED);
+        let known = self.0.iter().position(|twin| twin.id == other_id);
+        let since = known.map_or(Timestamp::default(), |known| self.0[known].at);
+        let (mut nats, mut is_own_alone, mut is_other_alone) = (0.0, false, false);
+        let mut at = since;
+        for look in own.iter() {
+            let Some(theirs) = other.get(look.sensor) else {
+                continue;
+            };
+            let is_new = look.last_look > since && look.last_look == theirs.last_look;
+            let [is_own, is_other] =
+                [look, theirs].map(|history| history.last_hit == Some(history.last_look));
+            if !is_new || !(is_own || is_other) {
+                continue;
+            }
+            at = at.max(look.last_look);
+            let rate = rate(look);
+            if is_own && is_other {
+                nats -= (rate / DUPLICATE).ln().max(0.0);
+            } else {
+                nats += (-(2.0 * (1.0 - rate)).ln()).max(0.0);
+                is_own_alone |= is_own;
+                is_other_alone |= is_other;
+            }
+        }
+        if nats > 0.0 && !(is_own_alone && is_other_alone) {
+            nats = 0.0;
+        }
+        match known {
+            Some(known) => {
+                let twin = &mut self.0[known];
+                twin.nats = (twin.nats + nats).max(-2.0 * TWIN_NATS);
+                twin.at = at;
+            }
+            None if nats != 0.0 => self.0.push(Twin {
+                id: other_id,
+                nats,
+                at,
+            }),
+            None => {}
+        }
+    }
+
+    /// True if the track of this identity is the same object.
+    pub(super) fn is_twin(&self, id: Uuid) -> bool {
+        self.0
+            .iter()
+            .any(|twin| twin.id == id && twin.nats > TWIN_NATS)
+    }
+}
