@@ -33,10 +33,10 @@ const MIN_STATED: f64 = 0.8;
 /// Maximum time in seconds since its last detection of an object of which its cell states that it exists.
 const MAX_STATED_AGE_S: f64 = 0.5;
 
-/// Standard deviation of a velocity that is taken over: in metres per second, and as a share of it. With that share a
-/// track can follow an object that stands.
-const VELOCITY_SIGMA_MPS: f64 = 1.0;
-const VELOCITY_SIGMA_SHARE: f64 = 0.3;
+/// Standard deviation of a velocity that is taken over, as its value may be wrong: in metres per second, and as a share of
+/// the speed.
+const VELOCITY_SIGMA_MPS: f64 = 2.0;
+const VELOCITY_SIGMA_SHARE: f64 = 0.5;
 
 /// Time in seconds for which objects of two cells move apart by the errors of their clocks.
 const CLOCK_ERROR_S: f64 = 0.1;

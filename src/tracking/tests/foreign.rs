@@ -285,7 +285,7 @@ proptest! {
 
     /// Ghosts beside and upon this cell's objects, with any velocity, age and precision, and with their identities.
     #[test]
-    fn a_cell_that_lies_harms_no_object_of_this_cell(seed in any::<u64>()) {
+    fn a_cell_that_lies_harms_no_object_of_this_cell(seed in prop_oneof![1 => Just(4_861_703_545_525_720_796), 5 => any::<u64>()]) {
         let honest = lied_to(&mut tracker(), |_, _| Vec::new());
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let lied = lied_to(&mut tracker(), |frame, own| {
