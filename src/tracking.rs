@@ -3,8 +3,8 @@
 //! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and closes rounds by [`Tracker::close`]. Within a round,
 //! reports count in the order of capture, whatever the order of arrival. `docs/tracks.md` has the equations.
 //!
-//! Nothing has to be known of a vehicle beforehand. Its noise, field of view, detection rates, calibration and pose bias
-//! are learnt from what it has in common with the others. Received maps lend identities and no evidence: no track is
+//! A vehicle needs no calibration beforehand. Its noise, field of view, detection rates, calibration and pose bias
+//! are estimated from what it has in common with the others. Received maps lend identities and no evidence: no track is
 //! spawned or kept alive by them.
 
 mod assignment;

@@ -4,7 +4,7 @@
 //! probability follows from the results of looks alone, so that confidences do not confirm themselves. Without
 //! evidence, a confidence is the probability that it states.
 
-/// Learnt relation between confidence and evidence of one vehicle.
+/// Estimated relation between confidence and evidence of one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct DetectionCalibration {
     /// Numbers of detections of objects and of clutter by confidence.
@@ -20,7 +20,7 @@ const MIN_NATS: f64 = -4.8;
 /// Number of detections as which the prior counts in each bin.
 const PRIOR: f64 = 4.0;
 
-/// Number of detections beyond which earlier ones are forgotten.
+/// Number of detections beyond which earlier ones are discounted.
 const MEMORY: f64 = 4000.0;
 
 /// Maximum evidence of one confidence, nats.
@@ -59,7 +59,7 @@ impl DetectionCalibration {
         ratio.ln().clamp(-MAX_NATS, MAX_NATS)
     }
 
-    /// Learns from a detection of a track that is an object with a probability.
+    /// Updates the relation with a detection of a track that is an object with a probability.
     pub(super) fn learn(&mut self, log_odds: f64, probability: f64) {
         let bin = bin(log_odds);
         self.objects[bin] += probability;

@@ -52,7 +52,7 @@ pub struct TracksConfig {
     pub latent_s: f64,
     /// Maximum time in seconds of a report behind the latest that was fused. Default 0.5; later reports are counted.
     pub max_lag_s: f64,
-    /// Confidence at which a detection is as likely real as not, until it is learnt. Default 0.3.
+    /// Confidence at which a detection is as likely real as not, until it is estimated. Default 0.3.
     pub even_confidence: f64,
     /// Minimum confidence of a published object. Default 0.002: users that need certainty set a limit of their own.
     pub min_confidence: f64,

@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 use super::existence::{DetectionRates, LookState};
 use crate::wire::{FieldOfView, ObjectReport, PerceivedObject};
 
-/// Learnt field of view and detection rates of one vehicle.
+/// Estimated field of view and detection rates of one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct Coverage {
     /// Position of the vehicle, metres, and unit vector of its heading.
@@ -118,7 +118,7 @@ impl Coverage {
         Some(&self.rates[Self::bin(distance_m)])
     }
 
-    /// Learns from a look at an object that exists with a probability; `state` is that before the look.
+    /// Updates the rates with a look at an object that exists with a probability; `state` is that before the look.
     pub(super) fn learn(
         &mut self,
         reported: &Vector2<f64>,

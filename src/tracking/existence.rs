@@ -4,7 +4,7 @@
 //! place adds the log-likelihood ratio of its result: a detection or none, if an object is there and if the track is
 //! clutter. Looks of one vehicle are not independent: what hides an object, or looks like one, is still there a tenth
 //! of a second later. So the results of one vehicle are a Markov chain under both hypotheses, and the probability of a
-//! detection depends on the [result before](LookState). All probabilities are learnt by vehicle. Between looks, an
+//! detection depends on the [result before](LookState). All probabilities are estimated by vehicle. Between looks, an
 //! object may leave.
 //!
 //! Confidences are evidence of their own. Those of one vehicle are correlated: n of them with correlation ρ weigh as
@@ -97,7 +97,7 @@ impl LookState {
     }
 }
 
-/// Probability of a detection at a look, by the state before it, learnt as the mean of a beta distribution.
+/// Probability of a detection at a look, by the state before it, estimated as the mean of a beta distribution.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DetectionRates {
     /// Numbers of detections and of looks.
@@ -108,7 +108,7 @@ impl DetectionRates {
     /// Number of looks as which the usual rates count.
     const USUAL_LOOKS: f64 = 10.0;
 
-    /// Number of looks beyond which earlier ones are forgotten.
+    /// Number of looks beyond which earlier ones are discounted.
     const MEMORY: f64 = 400.0;
 
     fn usual(rates: [f64; LookState::COUNT]) -> Self {
@@ -133,7 +133,7 @@ impl DetectionRates {
         (hits / looks).clamp(0.01, 0.985)
     }
 
-    /// Learns from a look with a weight, 0 to 1.
+    /// Updates the mean with a look of a weight, 0 to 1.
     pub(super) fn learn(&mut self, state: LookState, is_hit: bool, weight: f64) {
         let (hits, looks) = &mut self.counts[state.index()];
         *hits += weight * f64::from(u8::from(is_hit));

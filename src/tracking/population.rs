@@ -1,4 +1,4 @@
-//! Births and departures of objects in the whole cell, learnt from the tracks.
+//! Births and departures of objects in the whole cell, estimated from the tracks.
 
 /// Which share of new tracks become objects, and how long objects stay.
 #[derive(Debug, Clone)]
@@ -31,7 +31,7 @@ impl Population {
     const USUAL_STAY_S: f64 = 15.0;
     const USUAL_TIME_S: f64 = 60.0;
 
-    /// Number of births, and time in seconds, beyond which earlier ones are forgotten.
+    /// Number of births, and time in seconds, beyond which earlier ones are discounted.
     const MAX_BIRTHS: f64 = 400.0;
     const MAX_TIME_S: f64 = 3000.0;
 
@@ -45,7 +45,7 @@ impl Population {
         self.departures / self.stayed_s
     }
 
-    /// Learns that a track turned out to be an object, or clutter.
+    /// Counts a track that turned out to be an object, or clutter.
     pub(super) fn settle(&mut self, is_object: bool) {
         if is_object {
             self.objects += 1.0;
@@ -57,7 +57,7 @@ impl Population {
         self.clutter *= kept;
     }
 
-    /// Learns that objects stayed for so many seconds, added up.
+    /// Counts the seconds for which objects stayed, added up.
     pub(super) fn stay(&mut self, seconds: f64) {
         self.stayed_s += seconds;
         let kept = (Self::MAX_TIME_S / self.stayed_s).min(1.0);
@@ -65,7 +65,7 @@ impl Population {
         self.departures *= kept;
     }
 
-    /// Learns that an object left.
+    /// Counts an object that left.
     pub(super) fn leave(&mut self) {
         self.departures += 1.0;
     }

@@ -1,4 +1,4 @@
-//! Owner of the sensor models: what is learnt of each vehicle. The only module that creates a [`SensorId`].
+//! Owner of the sensor models: what is estimated of each vehicle. The only module that creates a [`SensorId`].
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -178,7 +178,7 @@ impl Sensors {
     }
 }
 
-/// Learnt properties of one vehicle's sensor.
+/// Estimated properties of one vehicle's sensor.
 #[derive(Debug, Clone)]
 pub(super) struct SensorModel {
     pub(super) id: SensorId,
@@ -294,7 +294,7 @@ impl SensorModel {
     }
 }
 
-/// Noise of a vehicle's positions, learnt by distance along and across the line of sight.
+/// Noise of a vehicle's positions, estimated by distance along and across the line of sight.
 ///
 /// Reported covariances are scaled: the model learns the ratio of the squared residuals to them. Without, it learns the
 /// variances themselves, from a prior that grows with the distance.
@@ -355,7 +355,7 @@ impl NoiseModel {
     const PER_METRE: f64 = 0.012;
     const ACROSS: f64 = 0.5;
 
-    /// Maximum ratio of a squared residual to the present variance that is learnt from.
+    /// Maximum ratio of a squared residual to the present variance that is estimated from.
     const MAX_RATIO: f64 = 16.0;
 
     /// Variances along and across the line of sight at a distance, m².
