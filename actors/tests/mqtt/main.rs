@@ -1,11 +1,7 @@
-//! Gateways against real brokers: the embedded one, and mosquitto as the stranger.
+//! What goes over MQTT: a node's own connections, the region's broker, and plain clients at a node's broker.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
-
-mod broker;
-mod cell;
-mod junk;
-mod large;
-mod links;
+mod clients;
+mod door;
+mod gateway;
 mod mosquitto;
-mod status;
+mod uplink;

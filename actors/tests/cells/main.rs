@@ -1,0 +1,14 @@
+//! Cells of real nodes on loopback, most of them in this process: fusion, votes, failover, roaming and membership.
+
+#[cfg(feature = "camera")]
+mod camera_cell;
+mod cell;
+mod description;
+mod failover;
+mod membership;
+#[cfg(feature = "camera")]
+mod moving_vehicle;
+#[cfg(feature = "camera")]
+mod roaming;
+mod tracks;
+mod votes;

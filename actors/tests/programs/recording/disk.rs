@@ -1,0 +1,222 @@
+//! Processes that are killed, and disks that take nothing.
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use ecod::wire::Role;
+use ecod_actors::node;
+use ecod_actors::observe::recorder::{RecordConfig, SchemaName, files};
+use ecod_actors::telemetry::counters::Event;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::recording::cell::{Log, config, free_address};
+
+/// A node as a process; killed when dropped.
+pub(crate) struct Process(pub(crate) Child);
+
+impl Process {
+    /// Asks the process to end, and waits for it.
+    pub(crate) fn terminate(&mut self) {
+        kill(Pid::from_raw(self.0.id() as i32), Signal::SIGTERM).unwrap();
+        assert!(self.0.wait().unwrap().success());
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().unwrap();
+    }
+}
+
+/// An edge that records, started by a shell after `prelude`.
+pub(crate) fn edge(directory: &Path, prelude: &str) -> Process {
+    node_of(Role::Edge, directory, prelude)
+}
+
+/// The same in another role; its name is `edge` all the same.
+pub(crate) fn node_of(role: Role, directory: &Path, prelude: &str) -> Process {
+    let address = free_address();
+    let file = directory.join("edge.toml");
+    let config = config("edge", role, Some(address), address, directory);
+    std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
+    let script = format!(
+        "{prelude} exec {} --config {}",
+        env!("CARGO_BIN_EXE_ecod-node"),
+        file.display()
+    );
+    let log = std::fs::File::create(directory.join("edge.log")).unwrap();
+    Process(
+        Command::new("sh")
+            .args(["-c", &script])
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .unwrap(),
+    )
+}
+
+pub(crate) fn wait_until(what: &str, directory: &Path, holds: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    while !holds() {
+        let log = || std::fs::read_to_string(directory.join("edge.log")).unwrap_or_default();
+        assert!(Instant::now() < deadline, "never: {what}\n{}", log());
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+pub(crate) fn maps(directory: &Path) -> usize {
+    if directory.exists() {
+        Log::read(directory).count(SchemaName::GlobalMap)
+    } else {
+        0
+    }
+}
+
+/// SIGKILL costs what was not flushed, a second at most, and the rest is read.
+#[test]
+fn a_log_outlives_the_kill_of_its_process() {
+    let directory = tempfile::tempdir().unwrap();
+    let dir = directory.path().join("edge");
+    let mut process = edge(directory.path(), "");
+    wait_until("maps are on the disk", directory.path(), || {
+        maps(&dir) >= 20
+    });
+    process.0.kill().unwrap();
+    let killed_at = ecod_actors::platform::clock::now();
+    process.0.wait().unwrap();
+    let log = Log::read(&dir);
+    assert!(log.count(SchemaName::GlobalMap) >= 20 && log.identity.is_some());
+    assert!(
+        log.problems
+            .iter()
+            .all(|problem| problem.contains("not finished")),
+        "{:?}",
+        log.problems
+    );
+    let lost = killed_at.since(log.messages.last().unwrap().at);
+    eprintln!("lost to SIGKILL: {lost:?}");
+    assert!(lost < Duration::from_secs(4), "{lost:?} were lost");
+}
+
+/// A file that takes no more, as on a full disk, is given up for the next; the node goes on all the while.
+#[test]
+fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
+    let directory = tempfile::tempdir().unwrap();
+    let dir = directory.path().join("edge");
+    let mut process = edge(directory.path(), "trap '' XFSZ; ulimit -f 24;");
+    wait_until("a second file", directory.path(), || {
+        files(&dir).is_ok_and(|files| files.len() >= 2)
+    });
+    wait_until("maps in the second file", directory.path(), || {
+        let log = Log::read(&dir);
+        log.problems
+            .iter()
+            .any(|problem| problem.contains("not finished"))
+            && log.count(SchemaName::GlobalMap) > 0
+    });
+    assert_eq!(process.0.try_wait().unwrap(), None, "the node goes on");
+    let said = std::fs::read_to_string(directory.path().join("edge.log")).unwrap();
+    assert!(said.contains("not recording, the node goes on"), "{said}");
+    process.terminate();
+    let log = Log::read(&dir);
+    let is = |message: &&ecod_actors::observe::recorder::LogMessage, text: &str| {
+        message.schema == SchemaName::JournalEntry
+            && String::from_utf8_lossy(&message.json).contains(text)
+    };
+    assert!(
+        log.messages
+            .iter()
+            .any(|message| is(&message, "\"continue\"")),
+        "the second file says where it begins"
+    );
+    assert!(
+        log.messages
+            .iter()
+            .any(|message| is(&message, "\"missing\"")),
+        "and that something is lost"
+    );
+}
+
+/// A follower takes no reports of others unless told to, which shows in the log of the node, not only in what is
+/// missing afterwards.
+#[test]
+fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
+    for (role, says_so) in [(Role::Cav, true), (Role::Auto, false)] {
+        let directory = tempfile::tempdir().unwrap();
+        let _process = node_of(role, directory.path(), "");
+        let said =
+            || std::fs::read_to_string(directory.path().join("edge.log")).unwrap_or_default();
+        wait_until("it records", directory.path(), || {
+            said().contains("edge/edge-")
+        });
+        assert_eq!(
+            said().contains("key `record.reports` is false"),
+            says_so,
+            "{}",
+            said()
+        );
+    }
+}
+
+/// A map log on a full disk, or on one that cannot be written, costs no map and no start.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
+    for path in ["/dev/full", "/proc/maps.jsonl"] {
+        let directory = tempfile::tempdir().unwrap();
+        let address = free_address();
+        let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+        (config.map_log, config.record) = (Some(path.into()), None);
+        let node = node::start(config).await.unwrap();
+        let mut maps = node.newest_map();
+        let reached =
+            maps.wait_for(|newest| newest.as_ref().is_some_and(|newest| newest.map.round > 5));
+        tokio::time::timeout(Duration::from_secs(30), reached)
+            .await
+            .expect("maps go on")
+            .unwrap();
+        node.stop().await;
+    }
+}
+
+/// A directory that cannot be made is counted and tried again.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_directory_that_cannot_be_made_is_tried_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = free_address();
+    let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+    let dir = directory.path().join("blocked/log");
+    std::fs::write(directory.path().join("blocked"), "a file").unwrap();
+    config.record = Some(RecordConfig {
+        min_free_mb: 0,
+        ..RecordConfig::new(&dir)
+    });
+    let node = node::start(config).await.unwrap();
+    let until = async |what: &str, holds: &dyn Fn() -> bool| {
+        let reached = async {
+            while !holds() {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(30), reached)
+            .await
+            .unwrap_or_else(|_| panic!("never: {what}"));
+    };
+    let counters = node.counters().clone();
+    until("failures are counted", &|| {
+        counters.events(Event::RecordFailed) > 0
+    })
+    .await;
+    until("the node leads", &|| node.newest_map().borrow().is_some()).await;
+    assert_eq!(counters.events(Event::Recorded), 0);
+    assert!(counters.events(Event::RecordDropped) > 0);
+    std::fs::remove_file(directory.path().join("blocked")).unwrap();
+    until("entries are written", &|| {
+        counters.events(Event::Recorded) > 20
+    })
+    .await;
+    node.stop().await;
+    assert!(Log::read(&dir).count(SchemaName::GlobalMap) > 0);
+}

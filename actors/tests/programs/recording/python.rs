@@ -1,0 +1,86 @@
+//! The Python reader that everybody has agrees on what is in a log.
+
+use std::path::Path;
+use std::process::Command;
+
+use ecod_actors::observe::recorder::{SchemaName, files};
+
+use crate::recording::cell::Log;
+use crate::recording::disk::{edge, maps, wait_until};
+
+/// Prints schema and topic of every message; a log that was not finished is read as far as it goes.
+const SCRIPT: &str = "
+import json, sys
+from mcap.reader import NonSeekingReader, make_reader
+file = open(sys.argv[1], 'rb')
+is_finished = sys.argv[2] == 'finished'
+messages = make_reader(file).iter_messages() if is_finished else NonSeekingReader(file).iter_messages(log_time_order=False)
+try:
+    for schema, channel, message in messages:
+        json.loads(message.data)
+        print(schema.name, channel.topic)
+except Exception:
+    # The last record may be cut anywhere.
+    if is_finished: raise
+";
+
+/// The maps that Python finds in a log.
+fn maps_by(python: &str, dir: &Path, state: &str) -> usize {
+    let read = |log: &std::path::PathBuf| {
+        let run = Command::new(python)
+            .args(["-c", SCRIPT])
+            .arg(log)
+            .arg(state)
+            .output()
+            .unwrap();
+        assert!(
+            run.status.success(),
+            "{}",
+            String::from_utf8_lossy(&run.stderr)
+        );
+        let is_map = |line: &&str| line.starts_with("ecod.GlobalMap ");
+        String::from_utf8(run.stdout)
+            .unwrap()
+            .lines()
+            .filter(is_map)
+            .count()
+    };
+    files(dir).unwrap().iter().map(read).sum()
+}
+
+#[test]
+#[ignore = "needs the Python package mcap, which `make recording-check` installs"]
+fn the_python_reader_reads_a_finished_log_and_one_of_a_killed_process() {
+    let python = std::env::var("MCAP_PYTHON").unwrap_or("python3".into());
+    let has_reader = Command::new(&python)
+        .args(["-c", "import mcap"])
+        .output()
+        .is_ok_and(|output| output.status.success());
+    assert!(
+        has_reader,
+        "{python} has no package mcap: run `make recording-check`"
+    );
+    for state in ["finished", "killed"] {
+        let directory = tempfile::tempdir().unwrap();
+        let dir = directory.path().join("edge");
+        let mut process = edge(directory.path(), "");
+        wait_until("maps are on the disk", directory.path(), || {
+            maps(&dir) >= 20
+        });
+        if state == "finished" {
+            process.terminate();
+        } else {
+            process.0.kill().unwrap();
+            process.0.wait().unwrap();
+        }
+        let (theirs, ours) = (
+            maps_by(&python, &dir, state),
+            Log::read(&dir).count(SchemaName::GlobalMap),
+        );
+        // Of a chunk that is cut short, this project's own reader takes what is whole.
+        assert!(
+            theirs >= 20 && theirs <= ours && (state == "killed" || theirs == ours),
+            "{state}: {theirs} of {ours}"
+        );
+    }
+}

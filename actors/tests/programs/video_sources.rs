@@ -1,0 +1,426 @@
+//! Videos, pipelines and network cameras, which the program `ecod-video` reads for a node.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ecod_actors::camera::frame::CameraFrame;
+use ecod_actors::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus};
+use ecod_actors::camera::frame_source::{FrameError, FrameSource, SourceConfig};
+use ecod_actors::camera::image_codec::encode_jpeg;
+use ecod_actors::platform::clock;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use opencv::core::{CV_8UC3, Mat, Scalar, Size, Vec3b};
+use opencv::prelude::*;
+use opencv::videoio::VideoWriter;
+
+/// Maximum time for anything.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn gray(value: u8) -> Mat {
+    Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(f64::from(value))).unwrap()
+}
+
+fn brightness(frame: &CameraFrame) -> u8 {
+    frame.image.at_2d::<Vec3b>(24, 32).unwrap()[1]
+}
+
+fn source(toml: &str) -> SourceConfig {
+    assert!(Path::new(env!("CARGO_BIN_EXE_ecod-video")).is_file());
+    toml::from_str(toml).unwrap()
+}
+
+fn open(toml: &str) -> Result<Box<dyn FrameSource>, FrameError> {
+    source(toml).open(Duration::from_secs(5))
+}
+
+/// Brightness of all frames up to the error that ends them.
+fn play(source: &mut dyn FrameSource) -> (Vec<u8>, FrameError) {
+    let mut seen = Vec::new();
+    loop {
+        match source.next_frame() {
+            Ok(frame) => seen.push(brightness(&frame)),
+            Err(error) => return (seen, error),
+        }
+    }
+}
+
+fn near(seen: &[u8], expected: &[u8]) -> bool {
+    seen.len() == expected.len() && seen.iter().zip(expected).all(|(a, b)| a.abs_diff(*b) <= 4)
+}
+
+const CLIP: [u8; 3] = [40, 120, 200];
+
+fn write_clip(path: &Path, fps: f64) {
+    let mjpg = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
+    let mut writer = VideoWriter::new(path, mjpg, fps, Size::new(64, 48), true).unwrap();
+    assert!(writer.is_opened().unwrap());
+    CLIP.iter()
+        .for_each(|value| writer.write(&gray(*value)).unwrap());
+    writer.release().unwrap();
+}
+
+#[test]
+fn a_video_file_plays_once_or_again_and_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("clip.avi");
+    write_clip(&path, 200.0);
+    let mut source = open(&format!("kind = 'video'\npath = {path:?}")).unwrap();
+    let (seen, end) = play(source.as_mut());
+    assert!(near(&seen, &CLIP), "{seen:?}");
+    assert_eq!(
+        end,
+        FrameError::Ended {
+            origin: path.display().to_string()
+        }
+    );
+
+    let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = true")).unwrap();
+    let seen: Vec<u8> = (0..5)
+        .map(|_| brightness(&source.next_frame().unwrap()))
+        .collect();
+    assert!(near(&seen, &[40, 120, 200, 40, 120]), "{seen:?}");
+}
+
+#[test]
+fn frames_are_dated_by_the_clock_of_the_node() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("clip.avi");
+    write_clip(&path, 10.0);
+    clock::now();
+    let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = true")).unwrap();
+    let times: Vec<_> = (0..4)
+        .map(|_| source.next_frame().unwrap().captured_at)
+        .collect();
+    assert!(
+        times
+            .iter()
+            .all(|time| *time <= clock::now() && clock::now().since(*time) < PATIENCE),
+        "{times:?}"
+    );
+    let apart = times[3].since(times[0]);
+    assert!(
+        apart >= Duration::from_millis(290),
+        "three periods of 100 ms: {apart:?}"
+    );
+}
+
+#[test]
+fn a_pipeline_gives_frames() {
+    let pipeline = "videotestsrc num-buffers=3 pattern=white ! video/x-raw,width=64,height=48 ! videoconvert ! \
+                    video/x-raw,format=BGR ! appsink";
+    let mut source = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'")).unwrap();
+    let (seen, end) = play(source.as_mut());
+    assert_eq!(seen.len(), 3);
+    assert!(seen.iter().all(|value| *value > 230), "{seen:?}");
+    assert!(
+        matches!(end, FrameError::Lost { .. }),
+        "a live source does not end: {end}"
+    );
+}
+
+#[test]
+fn a_pipeline_with_a_missing_element_names_it_and_no_secret() {
+    let pipeline = "nosuchsrc location=rtsp://user:secret@camera/1 ! appsink";
+    let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'"))
+        .err()
+        .expect("missing")
+        .to_string();
+    assert!(
+        error.starts_with("cannot open nosuchsrc location=rtsp://camera/1"),
+        "{error}"
+    );
+    assert!(!error.contains("secret"), "{error}");
+}
+
+/// A network camera on a free port that answers whoever asks as `answer` does; its address.
+fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!(
+        "http://user:secret@{}/stream",
+        listener.local_addr().unwrap()
+    );
+    std::thread::spawn(move || {
+        for visitor in listener.incoming() {
+            // One that hangs up is none of the camera's business.
+            let _ = visitor.and_then(&answer);
+        }
+    });
+    url
+}
+
+/// Motion JPEG over HTTP, the way cheap network cameras speak.
+fn motion_jpeg(mut visitor: TcpStream) -> std::io::Result<()> {
+    let request = BufReader::new(visitor.try_clone()?);
+    let lines: Vec<String> = request
+        .lines()
+        .map_while(Result::ok)
+        .take_while(|line| !line.is_empty())
+        .collect();
+    if !lines
+        .iter()
+        .any(|line| line.starts_with("Authorization: Basic "))
+    {
+        return write!(
+            visitor,
+            "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n"
+        );
+    }
+    write!(
+        visitor,
+        "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n"
+    )?;
+    for value in (0..25).map(|number| 50 + 4 * number) {
+        let jpeg = encode_jpeg(&gray(value), 95).unwrap();
+        write!(
+            visitor,
+            "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n",
+            jpeg.len()
+        )?;
+        visitor.write_all(&jpeg)?;
+        write!(visitor, "\r\n")?;
+    }
+    Ok(())
+}
+
+#[test]
+fn a_network_camera_gives_frames_until_it_hangs_up() {
+    let url = network_camera(motion_jpeg);
+    let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
+    let (seen, end) = play(source.as_mut());
+    assert!(
+        seen.len() > 20 && seen.is_sorted() && seen[0].abs_diff(50) <= 4,
+        "{seen:?}"
+    );
+    let FrameError::Lost { origin, .. } = end else {
+        panic!("a live source does not end: {end}")
+    };
+    assert!(
+        origin.ends_with("/stream") && !origin.contains("secret"),
+        "{origin}"
+    );
+}
+
+#[test]
+fn a_network_camera_that_says_nothing_is_given_up_in_time() {
+    let held = std::sync::Mutex::new(Vec::new());
+    let url = network_camera(move |visitor| {
+        held.lock().unwrap().push(visitor);
+        Ok(())
+    });
+    let asked = Instant::now();
+    let error = source(&format!("kind = 'url'\nurl = '{url}'")).open(Duration::from_millis(300));
+    let error = error.err().expect("nothing comes").to_string();
+    assert!(
+        asked.elapsed() < Duration::from_secs(30),
+        "it has a limit of its own"
+    );
+    assert!(
+        error.starts_with("cannot open http://127.0.0.1") && !error.contains("secret"),
+        "{error}"
+    );
+}
+
+#[test]
+fn what_cannot_be_opened_is_named_with_its_reason() {
+    let directory = tempfile::tempdir().unwrap();
+    let text = directory.path().join("clip.avi");
+    fs::write(&text, "not a video").unwrap();
+    for (path, reason) in [
+        (Path::new("no/such.avi"), "No such file"),
+        (&text, "no video"),
+        (directory.path(), "directory"),
+    ] {
+        let error = open(&format!("kind = 'video'\npath = {path:?}"))
+            .err()
+            .expect("cannot be opened")
+            .to_string();
+        assert!(
+            error.starts_with(&format!("cannot open {}", path.display())) && error.contains(reason),
+            "{error}"
+        );
+    }
+}
+
+/// Programs `ecod-video` whose parent is this process, as (id, state).
+fn video_programs(parent: u32) -> BTreeSet<u32> {
+    let processes = fs::read_dir("/proc")
+        .unwrap()
+        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+    let is_ours = |id: &u32| {
+        let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap_or_default();
+        let has = |line: &str| status.lines().any(|it| it == line);
+        has("Name:\tecod-video")
+            && has(&format!("PPid:\t{parent}"))
+            && !status.contains("State:\tZ")
+    };
+    processes.filter(is_ours).collect()
+}
+
+fn is_running(id: u32) -> bool {
+    let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap_or_default();
+    status.contains("Name:\tecod-video") && !status.contains("State:\tZ")
+}
+
+fn until(what: &str, holds: impl Fn() -> bool) {
+    let end = Instant::now() + PATIENCE;
+    while !holds() {
+        assert!(Instant::now() < end, "never: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+fn signal(id: u32, signal: Signal) {
+    kill(Pid::from_raw(id as i32), signal).unwrap();
+}
+
+/// A process of its own that opens this source, so that its program is told from those of other tests.
+struct Opened {
+    process: Child,
+    program: u32,
+}
+
+/// `ecod-node` with a camera, whose detections come from an empty file.
+fn start_node(directory: &Path, source: &str) -> Opened {
+    let config = directory.join("node.toml");
+    let recorded = directory.join("detections.jsonl");
+    fs::write(&recorded, "[]\n").unwrap();
+    let text = format!(
+        "name = 'euclid'\ncell = 'video'\nrole = 'auto'\nlisten = '127.0.0.1:0'\ndashboard.enabled = false\n\
+         membership = {{ bind = '127.0.0.1:0', multicast.enabled = false }}\npose = {{ x_m = 0.0, y_m = 0.0, heading_deg = 0.0 }}\n\
+         [camera]\nsource = {source}\ndetector = {{ kind = 'recorded', path = {recorded:?}, looping = true }}\n\
+         capture = {{ stall_timeout_s = 1.0, retry_min_s = 0.1, retry_max_s = 0.1 }}\n"
+    );
+    fs::write(&config, text).unwrap();
+    let log = fs::File::create(directory.join("log")).unwrap();
+    let mut node = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    node.env("RUST_LOG", "debug")
+        .args(["--stop-at-eof", "--config"])
+        .arg(config);
+    let process = node
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    let id = process.id();
+    until("the node has a program", || !video_programs(id).is_empty());
+    Opened {
+        program: *video_programs(id).first().unwrap(),
+        process,
+    }
+}
+
+impl Drop for Opened {
+    fn drop(&mut self) {
+        self.process.kill().ok();
+        self.process.wait().unwrap();
+    }
+}
+
+fn log(directory: &Path) -> String {
+    fs::read_to_string(directory.join("log")).unwrap()
+}
+
+/// A directory with a clip, and it as a source that plays for ever.
+fn looping_clip() -> (tempfile::TempDir, String) {
+    let directory = tempfile::tempdir().unwrap();
+    let path: PathBuf = directory.path().join("clip.avi");
+    write_clip(&path, 20.0);
+    let source = format!("{{ kind = 'video', path = {path:?}, looping = true }}");
+    (directory, source)
+}
+
+#[test]
+fn a_node_whose_program_is_killed_says_so_and_goes_on_with_another() {
+    let (directory, source) = looping_clip();
+    let node = start_node(directory.path(), &source);
+    signal(node.program, Signal::SIGKILL);
+    until("the node tells of it", || {
+        log(directory.path()).contains("ecod-video ended, signal: 9 (SIGKILL)")
+    });
+    until("frames come again", || {
+        log(directory.path()).contains("frame source runs again")
+    });
+    assert!(!video_programs(node.process.id()).contains(&node.program));
+}
+
+#[test]
+fn a_program_that_hangs_is_killed_and_replaced() {
+    let (directory, source) = looping_clip();
+    let node = start_node(directory.path(), &source);
+    signal(node.program, Signal::SIGSTOP);
+    until("the node tells of it", || {
+        log(directory.path()).contains("no frame for")
+    });
+    until("frames come again", || {
+        log(directory.path()).contains("frame source runs again")
+    });
+    until("the one that hung is gone", || !is_running(node.program));
+}
+
+#[test]
+fn no_program_outlives_its_node() {
+    let (directory, source) = looping_clip();
+    let mut stopped = start_node(directory.path(), &source);
+    drop(stopped.process.stdin.take());
+    assert!(stopped.process.wait().unwrap().success());
+    until("it ends with a node that stops", || {
+        !is_running(stopped.program)
+    });
+
+    let mut killed = start_node(directory.path(), &source);
+    killed.process.kill().unwrap();
+    until("it ends with a node that is killed", || {
+        !is_running(killed.program)
+    });
+}
+
+#[test]
+fn secrets_of_an_address_are_on_no_command_line_and_in_no_log() {
+    let directory = tempfile::tempdir().unwrap();
+    let url = network_camera(|visitor| {
+        motion_jpeg(visitor.try_clone()?)?;
+        // Longer than the node waits.
+        std::thread::sleep(PATIENCE);
+        Ok(())
+    });
+    let node = start_node(
+        directory.path(),
+        &format!("{{ kind = 'url', url = '{url}' }}"),
+    );
+    for file in ["cmdline", "environ"] {
+        let text = fs::read(format!("/proc/{}/{file}", node.program)).unwrap();
+        assert!(!String::from_utf8_lossy(&text).contains("secret"), "{file}");
+    }
+    until("the camera is lost", || {
+        log(directory.path()).contains("frame source failed")
+    });
+    assert!(
+        !log(directory.path()).contains("secret"),
+        "{}",
+        log(directory.path())
+    );
+}
+
+#[tokio::test]
+async fn a_capture_of_a_video_ends_with_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("clip.avi");
+    write_clip(&path, 200.0);
+    let source = source(&format!("kind = 'video'\npath = {path:?}"));
+    let opener = Arc::new(move || source.open(Duration::from_secs(5)));
+    let capture = Capture::start(opener, CaptureConfig::default()).unwrap();
+    let mut last = None;
+    while let Some(frame) = capture.next_frame().await {
+        last = Some(brightness(&frame));
+    }
+    assert!(near(&[last.expect("frames")], &[200]));
+    assert_eq!(*capture.status().borrow(), CaptureStatus::Ended);
+}

@@ -1,0 +1,398 @@
+//! Cells of real processes whose wall clocks are wrong, step, or start in 1970, by libfaketime.
+//!
+//! `make clocks` runs all trials and prints a table; every run of the tests has a reduced form.
+
+mod cell;
+mod feeder;
+mod record;
+
+use std::time::Duration;
+
+use cell::{Cell, Fake};
+use record::{Entry, Record};
+
+/// Nodes that see the landmark, and the client without a node.
+const VEHICLES: [&str; 4] = ["euclid", "gauss", "noether", "feeder"];
+
+/// Longest time without a vehicle's reports that its own wrong clock may cost.
+const OWN_LOSS: Duration = Duration::from_secs(2);
+
+/// Time for a process to start, to log in at the leader's broker and to send its first report.
+const START_TIME: Duration = Duration::from_secs(1);
+
+/// Longest time without a report of others: some rounds on a busy machine, but no clock.
+const OTHERS_LOSS: Duration = Duration::from_millis(500);
+
+/// Largest error of a map's date, once all three nodes that may lead are there.
+const DATE_ERROR: Duration = Duration::from_millis(500);
+
+/// One node's clock in one trial.
+struct Trial {
+    name: &'static str,
+    /// The node, or the client `feeder`.
+    whose: &'static str,
+    /// Its clock when it starts.
+    start: Fake,
+    /// Its clock later, one step after another.
+    steps: &'static [Fake],
+}
+
+/// Time between two steps, and from the last one to the end.
+const STEP_TIME: Duration = Duration::from_secs(8);
+
+static TRIALS: [Trial; 15] = [
+    Trial {
+        name: "vehicle 5 s ahead",
+        whose: "euclid",
+        start: Fake::Seconds(5),
+        steps: &[],
+    },
+    Trial {
+        name: "vehicle 5 s behind",
+        whose: "noether",
+        start: Fake::Seconds(-5),
+        steps: &[],
+    },
+    Trial {
+        name: "vehicle 7 min ahead",
+        whose: "euclid",
+        start: Fake::Seconds(420),
+        steps: &[],
+    },
+    Trial {
+        name: "vehicle a year behind",
+        whose: "noether",
+        start: Fake::Seconds(-31_536_000),
+        steps: &[],
+    },
+    Trial {
+        name: "vehicle in 1970, then set",
+        whose: "noether",
+        start: Fake::Year1970,
+        steps: &[Fake::Seconds(0)],
+    },
+    Trial {
+        name: "vehicle steps 3 s back",
+        whose: "euclid",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(-3)],
+    },
+    Trial {
+        name: "vehicle steps 5 s ahead and back",
+        whose: "noether",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(5), Fake::Seconds(0)],
+    },
+    Trial {
+        name: "client steps 3 s back, then ahead",
+        whose: "feeder",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(-3), Fake::Seconds(0)],
+    },
+    Trial {
+        name: "client a year behind",
+        whose: "feeder",
+        start: Fake::Seconds(-31_536_000),
+        steps: &[],
+    },
+    Trial {
+        name: "leader 5 s ahead",
+        whose: "edge",
+        start: Fake::Seconds(5),
+        steps: &[],
+    },
+    Trial {
+        name: "leader 5 s behind",
+        whose: "edge",
+        start: Fake::Seconds(-5),
+        steps: &[],
+    },
+    Trial {
+        name: "leader a year behind",
+        whose: "edge",
+        start: Fake::Seconds(-31_536_000),
+        steps: &[],
+    },
+    Trial {
+        name: "leader in 1970, then set",
+        whose: "edge",
+        start: Fake::Year1970,
+        steps: &[Fake::Seconds(0)],
+    },
+    Trial {
+        name: "leader steps 5 s ahead, 5 s back",
+        whose: "edge",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(5), Fake::Seconds(-5)],
+    },
+    Trial {
+        name: "leader steps to 1970 and back",
+        whose: "edge",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Year1970, Fake::Seconds(0)],
+    },
+];
+
+/// Trials of cells with certificates, in which the client without a node takes no part.
+static TRIALS_WITH_CERTIFICATES: [Trial; 3] = [
+    Trial {
+        name: "certificates: vehicle 5 s behind",
+        whose: "noether",
+        start: Fake::Seconds(-5),
+        steps: &[],
+    },
+    Trial {
+        name: "certificates: leader 5 s ahead",
+        whose: "edge",
+        start: Fake::Seconds(5),
+        steps: &[],
+    },
+    Trial {
+        name: "certificates: leader steps 5 s back, 5 s ahead",
+        whose: "edge",
+        start: Fake::Seconds(0),
+        steps: &[Fake::Seconds(-5), Fake::Seconds(5)],
+    },
+];
+
+/// The edge starts last: whatever its clock says, it takes over from a working leader.
+fn run(trial: &Trial) -> Outcome {
+    let has_certificates = TRIALS_WITH_CERTIFICATES
+        .iter()
+        .any(|other| other.name == trial.name);
+    let mut cell = if has_certificates {
+        Cell::with_certificates()
+    } else {
+        Cell::new()
+    };
+    let vehicles = if has_certificates {
+        &VEHICLES[..3]
+    } else {
+        &VEHICLES
+    };
+    let start = |cell: &mut Cell, name: &str| {
+        cell.start(
+            name,
+            if name == trial.whose {
+                trial.start
+            } else {
+                Fake::Off
+            },
+        );
+    };
+    let nodes = || VEHICLES.into_iter().filter(|name| *name != "feeder");
+    for name in nodes().filter(|name| *name != trial.whose) {
+        start(&mut cell, name);
+    }
+    if !has_certificates {
+        cell.feed(if trial.whose == "feeder" {
+            trial.start
+        } else {
+            Fake::Off
+        });
+    }
+    let others = vehicles.iter().filter(|name| **name != trial.whose);
+    cell.until("the others are used", |record| {
+        others.clone().all(|name| record.has_lately([name]))
+    });
+    if let Some(late) = nodes().find(|name| *name == trial.whose) {
+        let begun = cell.now();
+        start(&mut cell, late);
+        cell.until("it is used", |record| record.has_lately([late]));
+        let first = cell.record().times(begun, |map| map.has(late))[0];
+        assert!(
+            first.since(begun) <= START_TIME + OWN_LOSS,
+            "{}: used {:?} after its start",
+            trial.name,
+            first.since(begun)
+        );
+    }
+    cell.until("all are used", |record| {
+        vehicles.iter().all(|name| record.has_lately([name]))
+    });
+    let settled = cell.now();
+    cell.until("all run", |record| {
+        record.last_at().is_some_and(|at| at > settled)
+    });
+    start(&mut cell, "edge");
+    cell.until("the edge leads", |record| record.source() == Some("edge"));
+    let complete = cell.now() + OWN_LOSS;
+    let mut until = cell.now() + STEP_TIME;
+    for step in trial.steps {
+        cell.until("time passes", |record| {
+            record.last_at().is_some_and(|at| at > until)
+        });
+        cell.set(trial.whose, *step);
+        until = until + STEP_TIME;
+    }
+    cell.until("time passes", |record| {
+        record.last_at().is_some_and(|at| at > until)
+    });
+    let readiness = cell.readiness("edge");
+    let is_full = |map: &Entry<'_>| vehicles.iter().all(|name| map.has(name));
+    let idle = match trial.whose {
+        "edge" | "feeder" => cell.longest_idle("edge", settled, is_full),
+        vehicle => cell.longest_idle(vehicle, settled, |map| map.has(vehicle)),
+    };
+    let record = cell.record();
+    let losses = vehicles
+        .iter()
+        .map(|name| (*name, record.longest_without(name, settled)))
+        .collect();
+    Outcome {
+        maps: record.times(settled, |_| true).len(),
+        full: record.times(settled, is_full).len(),
+        losses,
+        readiness,
+        idle,
+        dated: record.farthest_date(complete),
+    }
+}
+
+struct Outcome {
+    maps: usize,
+    /// Maps with all vehicles.
+    full: usize,
+    /// Longest time without each.
+    losses: Vec<(&'static str, Duration)>,
+    readiness: String,
+    /// Longest time for which the node with that clock said that it is ready while it was of no use.
+    idle: Duration,
+    /// Largest difference between a map's date and the true time.
+    dated: Duration,
+}
+
+impl Outcome {
+    fn print(&self, trial: &Trial) {
+        let Self {
+            maps,
+            full,
+            losses,
+            readiness,
+            idle,
+            dated,
+        } = self;
+        let losses: Vec<_> = losses
+            .iter()
+            .map(|(name, loss)| format!("{name} {} ms", loss.as_millis()))
+            .collect();
+        println!(
+            "{:<46} {full:>4} of {maps:>4} maps have all; longest without {}; dates wrong by {:.3} s at most; ready and useless {} ms; edge: {readiness}",
+            trial.name,
+            losses.join(", "),
+            dated.as_secs_f64(),
+            idle.as_millis()
+        );
+    }
+
+    fn check(&self, trial: &Trial) {
+        for (name, loss) in &self.losses {
+            let may = if *name == trial.whose {
+                OWN_LOSS
+            } else {
+                OTHERS_LOSS
+            };
+            assert!(*loss <= may, "{}: {loss:?} without {name}", trial.name);
+        }
+        assert!(
+            self.dated <= DATE_ERROR,
+            "{}: dates wrong by {:?}",
+            trial.name,
+            self.dated
+        );
+        assert!(
+            self.idle <= OWN_LOSS,
+            "{}: ready and useless for {:?}",
+            trial.name,
+            self.idle
+        );
+    }
+}
+
+fn passes(trial: &Trial) {
+    let outcome = run(trial);
+    outcome.print(trial);
+    outcome.check(trial);
+}
+
+#[test]
+fn a_vehicle_from_1970_and_a_leader_that_steps_take_part() {
+    for trial in TRIALS.iter().filter(|trial| {
+        [
+            "vehicle in 1970, then set",
+            "leader steps 5 s ahead, 5 s back",
+        ]
+        .contains(&trial.name)
+    }) {
+        passes(trial);
+    }
+}
+
+/// Nobody believes its certificate, nor does it believe others': it says so and waits, and takes part as soon as its clock
+/// is set.
+#[test]
+fn a_node_with_a_certificate_waits_for_its_clock_and_says_so() {
+    for late in ["noether", "edge"] {
+        let mut cell = Cell::with_certificates();
+        for name in ["euclid", "gauss"] {
+            cell.start(name, Fake::Off);
+        }
+        cell.until("both are used", |record| {
+            record.has_lately(["euclid", "gauss"])
+        });
+        let started = cell.now();
+        cell.start(late, Fake::Year1970);
+        cell.until_unready(late, "this machine's clock says 1970-");
+        let waiting = cell.now() + STEP_TIME;
+        cell.until("time passes", |record| {
+            record.last_at().is_some_and(|at| at > waiting)
+        });
+        assert_eq!(
+            cell.longest_idle(late, started, |_| false),
+            Duration::ZERO,
+            "{late} was ready in 1970"
+        );
+        assert!(!cell.record().has_lately([late]) && cell.record().source() != Some(late));
+        cell.set(late, Fake::Seconds(0));
+        let set_at = cell.now();
+        let takes_part = |record: &Record| match late {
+            // As the better candidate it leads after its trial.
+            "edge" => record.source() == Some("edge"),
+            vehicle => record.has_lately([vehicle]),
+        };
+        cell.until("it takes part", takes_part);
+        let took = cell.first_ready(late, set_at).since(set_at);
+        println!("{late}, with a certificate, was ready {took:?} after its clock was set");
+        let end = cell.now() + OWN_LOSS;
+        cell.until("time passes", |record| {
+            record.last_at().is_some_and(|at| at > end)
+        });
+        let losses = ["euclid", "gauss"].map(|name| cell.record().longest_without(name, started));
+        println!("others lost {losses:?}, {}", cell.readiness(late));
+        assert!(
+            losses.iter().all(|loss| *loss <= OTHERS_LOSS),
+            "{late}: {losses:?}"
+        );
+        assert!(took <= OWN_LOSS, "{late}: {took:?}");
+        assert!(cell.readiness(late).contains("\"ready\":true"));
+    }
+}
+
+#[test]
+#[ignore = "takes minutes: make clocks"]
+fn all() {
+    let only = std::env::var("TRIAL").unwrap_or_default();
+    let tried = |trial: &'static Trial| {
+        let outcome = run(trial);
+        outcome.print(trial);
+        (trial, outcome)
+    };
+    let trials = TRIALS
+        .iter()
+        .chain(&TRIALS_WITH_CERTIFICATES)
+        .filter(|trial| trial.name.contains(&only));
+    let outcomes: Vec<_> = trials.map(tried).collect();
+    outcomes
+        .iter()
+        .for_each(|(trial, outcome)| outcome.check(trial));
+}

@@ -1,0 +1,214 @@
+//! Reads what the nodes wrote.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use anyhow::Context;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use serde::Deserialize;
+
+use crate::failover::analysis::Accepted;
+use crate::failover::doors;
+
+/// Part of a map log's line that the trials need.
+#[derive(Deserialize)]
+struct Line {
+    received_at_us: Timestamp,
+    map: Map,
+}
+
+#[derive(Deserialize)]
+struct Map {
+    epoch: u64,
+    aggregator: NodeName,
+    round: u64,
+    fused_at_us: Timestamp,
+    landmarks: Vec<Landmark>,
+}
+
+#[derive(Deserialize)]
+struct Landmark {
+    contributors: Vec<NodeName>,
+}
+
+/// All maps of a log; a line that a killed process left unfinished is none.
+pub(crate) fn accepted(path: &Path) -> anyhow::Result<Vec<Accepted>> {
+    maps(path, parse)
+}
+
+/// Number of maps in a log, from a time on, to which a node contributes nothing.
+pub(crate) fn without(path: &Path, node: &NodeName, since: Timestamp) -> anyhow::Result<u64> {
+    let lacks = |map: &Map| {
+        map.landmarks
+            .iter()
+            .all(|landmark| !landmark.contributors.contains(node))
+    };
+    let lines = whole_lines(path)?;
+    let lines = lines
+        .lines()
+        .map(serde_json::from_str::<Line>)
+        .collect::<Result<Vec<_>, _>>()?;
+    Ok(lines
+        .iter()
+        .filter(|line| line.received_at_us >= since && lacks(&line.map))
+        .count() as u64)
+}
+
+/// All maps that a client at a node's door got.
+pub(crate) fn at_door(path: &Path) -> anyhow::Result<Vec<Accepted>> {
+    maps(path, |line| {
+        let (time, payload) = line.split_once(' ').context("no time")?;
+        let map: Map = serde_json::from_str(payload)?;
+        Ok(map.received(doors::time(time).context("no time")?))
+    })
+}
+
+fn maps(
+    path: &Path,
+    parse: impl Fn(&str) -> anyhow::Result<Accepted>,
+) -> anyhow::Result<Vec<Accepted>> {
+    whole_lines(path)?
+        .lines()
+        .map(|line| parse(line).with_context(|| format!("map log {}", path.display())))
+        .collect()
+}
+
+/// The text of a log without an unfinished last line.
+fn whole_lines(path: &Path) -> anyhow::Result<String> {
+    let mut text = match fs::read_to_string(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(String::new()),
+        text => text.with_context(|| format!("cannot read {}", path.display()))?,
+    };
+    text.truncate(text.rfind('\n').unwrap_or_default());
+    Ok(text)
+}
+
+/// The last map of a log, if there is any yet.
+pub(crate) fn last_accepted(path: &Path) -> anyhow::Result<Option<Accepted>> {
+    let Some(tail) = tail(path)? else {
+        return Ok(None);
+    };
+    let Some((whole, _)) = tail.rsplit_once('\n') else {
+        return Ok(None);
+    };
+    let line = whole.rsplit('\n').next().unwrap_or_default();
+    // The tail may begin within the only line.
+    Ok(parse(line).ok())
+}
+
+/// Whom a node's log names as its standby, as of its last word on who leads.
+pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
+    let text = fs::read_to_string(log).with_context(|| format!("cannot read {}", log.display()))?;
+    let last = text.lines().rfind(|line| line.contains("position=Leading"));
+    let name = last
+        .and_then(|line| line.split("standby=").nth(1))
+        .and_then(|rest| rest.split_whitespace().next());
+    Ok(name.and_then(|name| NodeName::new(name).ok()))
+}
+
+fn parse(line: &str) -> anyhow::Result<Accepted> {
+    let Line {
+        received_at_us,
+        map,
+    } = serde_json::from_str(line)?;
+    Ok(map.received(received_at_us))
+}
+
+impl Map {
+    fn received(self, at: Timestamp) -> Accepted {
+        let Self {
+            epoch,
+            aggregator,
+            round,
+            fused_at_us: fused_at,
+            ..
+        } = self;
+        Accepted {
+            at,
+            epoch: Epoch::new(epoch, aggregator),
+            round,
+            fused_at,
+        }
+    }
+}
+
+fn tail(path: &Path) -> anyhow::Result<Option<String>> {
+    const TAIL_BYTES: u64 = 16 * 1024;
+    let mut file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file.with_context(|| format!("cannot read {}", path.display()))?,
+    };
+    let length = file.metadata()?.len();
+    file.seek(SeekFrom::Start(length.saturating_sub(TAIL_BYTES)))?;
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes)?;
+    Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    const LINE: &str = r#"{"received_at_us":1500,"map":{"schema":1,"aggregator":"edge","epoch":3,"round":88,
+        "fused_at_us":1400,"landmarks":[],"objects":[]}}"#;
+
+    fn file(text: &str) -> tempfile::NamedTempFile {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        file.write_all(text.as_bytes()).unwrap();
+        file
+    }
+
+    #[test]
+    fn a_line_cut_short_by_a_kill_is_left_out() {
+        let line = LINE.replace('\n', "");
+        let log = file(&format!(
+            "{line}\n{}\n{}",
+            line.replace("88", "89"),
+            &line[..40]
+        ));
+        let maps = accepted(log.path()).unwrap();
+        assert_eq!(
+            maps.iter().map(|map| map.round).collect::<Vec<_>>(),
+            [88, 89]
+        );
+        assert_eq!(maps[0].epoch.to_string(), "edge@3");
+        assert_eq!(last_accepted(log.path()).unwrap().as_ref(), maps.last());
+    }
+
+    #[test]
+    fn maps_without_a_node_count_from_a_time_on() {
+        let (maps, euclid) = (LINE.replace('\n', ""), NodeName::from_static("euclid"));
+        let seen = maps.replace(
+            r#""landmarks":[]"#,
+            r#""landmarks":[{"contributors":["euclid"]}]"#,
+        );
+        let log = file(&format!("{maps}\n{maps}\n{seen}\n"));
+        let without = |since| without(log.path(), &euclid, Timestamp(since)).unwrap();
+        assert_eq!((without(1500), without(1501)), (2, 0));
+    }
+
+    #[test]
+    fn a_log_that_is_not_there_yet_holds_no_maps() {
+        let missing = Path::new("no/such/log");
+        assert!(accepted(missing).unwrap().is_empty());
+        assert_eq!(last_accepted(missing).unwrap(), None);
+        assert_eq!(last_accepted(file("{\"received").path()).unwrap(), None);
+    }
+
+    #[test]
+    fn the_standby_is_whom_the_leader_named_last() {
+        let lines = "INFO leadership position=Leading epoch=edge@1\n\
+                     INFO leadership position=Leading epoch=edge@1 standby=v01\n\
+                     INFO leadership position=Following epoch=v01@2 standby=v02\n";
+        assert_eq!(
+            standby(file(lines).path()).unwrap().unwrap().as_str(),
+            "v01"
+        );
+        assert_eq!(standby(file("").path()).unwrap(), None);
+    }
+}

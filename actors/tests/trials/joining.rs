@@ -1,0 +1,290 @@
+//! A cell from nothing, as its owner makes it: one machine makes it, the others join by tokens.
+
+mod machines;
+
+use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Write};
+use std::net::UdpSocket;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// Maximum time for anything.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn ecod_node(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    for (key, _) in
+        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
+    {
+        command.env_remove(key);
+    }
+    command.args(arguments).stdin(Stdio::null());
+    command
+}
+
+pub(crate) fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let output = ecod_node(arguments).output().unwrap();
+    assert!(output.status.success(), "{arguments:?}: {}", said(&output));
+    said(&output)
+}
+
+fn fails(arguments: &[&str]) -> String {
+    let output = ecod_node(arguments).output().unwrap();
+    assert!(!output.status.success(), "{arguments:?}: {}", said(&output));
+    said(&output)
+}
+
+/// A process that ends with the test.
+pub(crate) struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().ok();
+    }
+}
+
+/// Runs a node by its files alone, but for the addresses, as all nodes are on one machine.
+fn run(directory: &Path, gossip: &str) -> Running {
+    let config = directory.join("node.toml");
+    let mut command = ecod_node(&[
+        "--listen",
+        "127.0.0.1:0",
+        "--no-dashboard",
+        "--config",
+        config.to_str().unwrap(),
+    ]);
+    command
+        .env("ECOD_MEMBERSHIP__BIND", gossip)
+        .env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false");
+    command.arg("--map-log").arg(directory.join("maps"));
+    Running(
+        command
+            .stderr(File::create(directory.join("log")).unwrap())
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap(),
+    )
+}
+
+/// Starts `invite`; gives it and the tokens in the order of the names.
+fn invite(directory: &str, seed: &str, names: &[&str]) -> (Running, Vec<String>) {
+    let mut command = ecod_node(&[
+        "invite",
+        "--role",
+        "auto",
+        "--dir",
+        directory,
+        "--listen",
+        "127.0.0.1:0",
+        "--seed",
+        seed,
+    ]);
+    let mut host = Running(
+        command
+            .args(names)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap(),
+    );
+    let lines = BufReader::new(host.0.stdout.take().unwrap()).lines();
+    let tokens = lines.filter_map(|line| {
+        Some(
+            line.unwrap()
+                .trim()
+                .strip_prefix("sudo ecod-node join ")?
+                .to_owned(),
+        )
+    });
+    let tokens: Vec<_> = tokens.take(names.len()).collect();
+    (host, tokens)
+}
+
+pub(crate) fn until(what: &str, holds: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !holds() {
+        assert!(Instant::now() < deadline, "never: {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
+    let machines = ["edge", "gauss", "euclid"].map(|_| tempfile::tempdir().unwrap());
+    let [edge, gauss, euclid] = machines
+        .each_ref()
+        .map(|machine| machine.path().to_str().unwrap());
+    let gossip = UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .to_string();
+
+    let said = succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
+    assert!(
+        said.contains("ecod-node invite NAME --dir")
+            && said.contains("ecod-node cell set --config")
+            && said.contains("start it: ecod-node --config"),
+        "{said}"
+    );
+    let mut nodes = vec![run(Path::new(edge), &gossip)];
+    let (mut host, tokens) = invite(edge, &gossip, &["gauss", "euclid"]);
+    let [for_gauss, for_euclid] = &*tokens else {
+        panic!("{tokens:?}")
+    };
+    let damaged = fails(&["join", &for_gauss[..for_gauss.len() - 1], "--dir", gauss]);
+    assert!(damaged.contains("not the whole of it"), "{damaged}");
+    succeeds(&["join", for_gauss, "--dir", gauss]);
+    let again = fails(&["join", for_gauss, "--dir", gauss]);
+    assert!(again.contains("belongs to a node already"), "{again}");
+    let elsewhere = tempfile::tempdir().unwrap();
+    let again = fails(&[
+        "join",
+        for_gauss,
+        "--dir",
+        elsewhere.path().to_str().unwrap(),
+    ]);
+    assert!(again.contains("the token was used already"), "{again}");
+    let mut join = ecod_node(&["join", "-", "--dir", euclid])
+        .stdin(Stdio::piped())
+        .spawn()
+        .unwrap();
+    writeln!(join.stdin.take().unwrap(), "{for_euclid}").unwrap();
+    assert!(
+        join.wait().unwrap().success(),
+        "the token comes from standard input"
+    );
+    assert!(host.0.wait().unwrap().success(), "all have joined");
+    let late = fails(&[
+        "join",
+        for_euclid,
+        "--dir",
+        elsewhere.path().to_str().unwrap(),
+    ]);
+    assert!(
+        late.contains("is `ecod-node invite` still running"),
+        "{late}"
+    );
+
+    for directory in [edge, gauss, euclid] {
+        for secret in ["node.key", "cell.key"] {
+            let mode = fs::metadata(Path::new(directory).join(secret))
+                .unwrap()
+                .permissions()
+                .mode();
+            assert_eq!(mode & 0o777, 0o600, "{directory}/{secret}");
+        }
+    }
+    let kept: Vec<_> = fs::read_dir(Path::new(edge).join("pki/nodes"))
+        .unwrap()
+        .map(|f| f.unwrap().file_name())
+        .collect();
+    assert_eq!(
+        kept,
+        ["edge.pem"],
+        "no private key of a node is with the CA"
+    );
+
+    nodes.extend([gauss, euclid].map(|directory| run(Path::new(directory), "127.0.0.1:0")));
+    for directory in [gauss, euclid] {
+        until("maps of the edge on all", || {
+            let maps = fs::read_to_string(Path::new(directory).join("maps")).unwrap_or_default();
+            maps.contains("\"aggregator\":\"edge\"")
+        });
+    }
+}
+
+#[test]
+fn a_node_that_joins_a_cell_of_a_city_takes_the_citys_vehicles() {
+    let machines = ["city", "edge", "gauss"].map(|_| tempfile::tempdir().unwrap());
+    let [city, edge, gauss] = machines
+        .each_ref()
+        .map(|machine| machine.path().to_str().unwrap());
+    let gossip = UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .to_string();
+    succeeds(&["pki", "city", "init", "--city", "town", "--dir", city]);
+    succeeds(&["pki", "city", "issue", "euclid", "--dir", city]);
+    succeeds(&[
+        "init", "lot-1", "edge", "--role", "edge", "--city", city, "--dir", edge,
+    ]);
+    let list = Path::new(edge).join("city-revoked.pem");
+    let kept = fs::read_to_string(&list).unwrap();
+    fs::remove_file(&list).unwrap();
+    let incomplete = fails(&["invite", "gauss", "--dir", edge, "--listen", "127.0.0.1:0"]);
+    assert!(
+        incomplete.contains("city-revoked.pem is missing: a city has signed the cell's CA"),
+        "{incomplete}"
+    );
+    fs::write(&list, kept).unwrap();
+    let (mut host, tokens) = invite(edge, &gossip, &["gauss"]);
+    succeeds(&["join", &tokens[0], "--dir", gauss]);
+    assert!(host.0.wait().unwrap().success(), "it has joined");
+    for file in ["city.pem", "city-revoked.pem"] {
+        let [given, has] = [edge, gauss]
+            .map(|directory| fs::read_to_string(Path::new(directory).join(file)).unwrap());
+        assert_eq!(given, has, "{file}");
+    }
+    // The vehicle of the city, by the files of the city and the cell's key.
+    let euclid = tempfile::tempdir().unwrap();
+    let at = |directory: &str, file: &str| Path::new(directory).join(file).display().to_string();
+    let [ca, cell_list] = ["ca.pem", "revoked.pem"].map(|file| at(gauss, file));
+    let [city_ca, city_list] = ["ca.pem", "revoked.pem"].map(|file| at(city, file));
+    let [certificate, key] = ["nodes/euclid.pem", "nodes/euclid.key"].map(|file| at(city, file));
+    let configuration = format!(
+        "name = \"euclid\"\ncell = \"lot-1\"\nrole = \"cav\"\n[membership]\nkey_file = {:?}\nseeds = [{gossip:?}]\n\
+         [tls]\nca = {ca:?}\ncertificate = {certificate:?}\nkey = {key:?}\nrevocation_list = {cell_list:?}\n\
+         [tls.city]\nca = {city_ca:?}\nrevocation_list = {city_list:?}\n",
+        at(gauss, "cell.key")
+    );
+    fs::write(euclid.path().join("node.toml"), configuration).unwrap();
+    // The node that joined leads alone: the vehicle takes its maps if both trust the other.
+    let _nodes = [
+        run(Path::new(gauss), &gossip),
+        run(euclid.path(), "127.0.0.1:0"),
+    ];
+    until("maps of the node that joined at the vehicle", || {
+        let maps = fs::read_to_string(euclid.path().join("maps")).unwrap_or_default();
+        maps.contains("\"aggregator\":\"gauss\"")
+    });
+}
+
+#[test]
+fn init_and_invite_say_why_they_refuse() {
+    let machine = tempfile::tempdir().unwrap();
+    let missing = fails(&["invite", "gauss", "--dir", machine.path().to_str().unwrap()]);
+    assert!(
+        missing.contains("has no CA: run `ecod-node invite` on the machine where `ecod-node init`"),
+        "{missing}"
+    );
+    let directory = machine.path().to_str().unwrap();
+    let reserved = fails(&["init", "lot-1", "edge--a", "--dir", directory]);
+    assert!(
+        reserved.contains("names of nodes have no `--`"),
+        "{reserved}"
+    );
+    succeeds(&["init", "lot-1", "edge", "--dir", directory]);
+    let again = fails(&["init", "lot-1", "edge", "--dir", directory]);
+    assert!(again.contains("belongs to a node already"), "{again}");
+    let reserved = fails(&[
+        "invite",
+        "gauss--lidar",
+        "--dir",
+        directory,
+        "--listen",
+        "127.0.0.1:0",
+    ]);
+    assert!(
+        reserved.contains("names of nodes have no `--`"),
+        "{reserved}"
+    );
+}

@@ -1,0 +1,7 @@
+//! The core as its users call it: fusion by PACE, tracking, VOTE, and the program that the README shows.
+
+mod examples;
+mod moving_on;
+mod pace;
+mod tracks;
+mod vote;

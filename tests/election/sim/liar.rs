@@ -1,0 +1,574 @@
+//! A candidate that does not outrank the leader says whatever takes the lead.
+
+use ecod::leadership::Rights;
+use ecod::leadership::election::{
+    Body, Candidacy, ElectionConfig, ElectionMessage, LifeSign, MAX_ROUND, MAX_TERM, MAX_TERM_STEP,
+};
+use ecod::leadership::node::Input;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::wire::{Role, SCHEMA_VERSION};
+
+use super::{SECOND, cell, check, ensure, for_seeds, one_best_leader, seeds, start_all};
+use crate::sim::node::Fault;
+use crate::sim::world::{MS, World};
+
+/// Sequence numbers beyond those of the liar's own election, which nobody hears any more.
+const FORGED: u64 = 1 << 40;
+
+/// The lead stays where it is, and every honest node gets its rounds, while one in twenty packets is lost.
+#[test]
+fn a_liar_takes_the_lead_from_nobody() {
+    for_seeds(seeds() / 10, |seed| {
+        let mut world = cell(seed);
+        start_all(&mut world);
+        check(&mut world, seed, |world| {
+            world.run_for(9 * SECOND);
+            let leader = world.leaders()[0];
+            // A leader that nobody else follows makes way for its like.
+            let rank = |node: usize| {
+                (
+                    world.nodes[node].config.role,
+                    world.nodes[node].config.priority,
+                )
+            };
+            let may_lie = |world: &World, node: usize| {
+                node != leader
+                    && rank(node).0 != Role::Cav
+                    && (world.nodes.len() > 2 || rank(node) != rank(leader))
+            };
+            let Some(liar) = (0..world.nodes.len()).find(|node| may_lie(world, *node)) else {
+                return Ok(());
+            };
+            one_best_leader(world)?;
+            world.loss_percent = seed % 6;
+            let before = world.led.len();
+            for lie in 0..1000 {
+                tell_lies(world, liar, leader, FORGED + lie);
+                world.run_for(10 * MS);
+                ensure(world.nodes[leader].leads(), "the leader gave way")?;
+                for (index, node) in world.alive().filter(|(index, _)| *index != liar) {
+                    let follows = node.leader() == Some(&world.nodes[leader].name);
+                    ensure(
+                        index == leader || follows,
+                        &format!("{} left the leader", node.name),
+                    )?;
+                }
+            }
+            // Pauses of 0.4, 0.4, 0.8, 1.6 and 3.2 s lie between renewals; the next would be the seventh.
+            ensure(
+                world.led.len() <= before + 6,
+                "the leader renews its term without end",
+            )
+        });
+    });
+}
+
+/// The leader hangs, and a member answers each question about it with "it is alive": it takes as long as without the member
+/// until another node leads. The member has the leader's last sign of life, and can make none.
+#[test]
+fn a_member_that_vouches_for_a_hung_leader_delays_no_takeover() {
+    for_seeds(seeds() / 5, |seed| {
+        let mut world = cell(seed);
+        start_all(&mut world);
+        check(&mut world, seed, |world| {
+            world.run_for(9 * SECOND);
+            one_best_leader(world)?;
+            let leader = world.leaders()[0];
+            let is_candidate =
+                |node: usize| node != leader && world.nodes[node].config.role != Role::Cav;
+            let candidates: Vec<usize> = (0..world.nodes.len())
+                .filter(|node| is_candidate(*node))
+                .collect();
+            // Of two candidates, one is honest. Large cells take long to lie to.
+            let [liar, _, ..] = candidates[..] else {
+                return Ok(());
+            };
+            if world.nodes.len() > 8 {
+                return Ok(());
+            }
+            let life = life_of(world, leader);
+            world.plan(
+                0,
+                Fault::Pause {
+                    node: leader,
+                    micros: 20 * SECOND,
+                },
+            );
+            let hung_at = world.now;
+            let has_taken_over = |world: &World| {
+                world
+                    .alive()
+                    .any(|(node, state)| node != leader && node != liar && state.leads())
+                    || world.nodes[liar].leads()
+            };
+            let lie = LIES.iter().find(|lie| lie.message == "vouch").unwrap();
+            let mut seq = FORGED;
+            while !has_taken_over(world) {
+                // Questions have small numbers.
+                for _ in 0..100 {
+                    seq += 1;
+                    tell(world, lie, (liar, leader), seq, &life);
+                }
+                world.run_for(20 * MS);
+                ensure(
+                    world.now - hung_at <= SECOND,
+                    "nobody has taken over after a second",
+                )?;
+            }
+            Ok(())
+        });
+    });
+}
+
+/// What a false message is about.
+struct Scene {
+    liar: NodeName,
+    /// The present leadership, and its last sign of life.
+    present: Epoch,
+    life: LifeSign,
+    /// Any node.
+    other: NodeName,
+    seq: u64,
+}
+
+/// A false message.
+struct Statement {
+    term: u64,
+    epoch: Option<Epoch>,
+    hears_you: bool,
+    body: Body,
+}
+
+/// One kind of false message that a member sends.
+struct Lie {
+    message: &'static str,
+    lie: &'static str,
+    /// True if the sender says that it leads.
+    claims: bool,
+    state: fn(&Scene) -> Statement,
+}
+
+impl Scene {
+    /// A message about the present leadership, with this body.
+    fn of_present(&self, body: Body) -> Statement {
+        let epoch = self.present.clone();
+        Statement {
+            term: epoch.term,
+            epoch: Some(epoch),
+            hears_you: true,
+            body,
+        }
+    }
+
+    /// A message about the next leadership, of this node.
+    fn of_next(&self, leader: &NodeName, body: Body) -> Statement {
+        let epoch = Epoch::new(self.present.term + 1, leader.clone());
+        Statement {
+            term: epoch.term,
+            epoch: Some(epoch),
+            hears_you: true,
+            body,
+        }
+    }
+
+    /// A message of a node without a leader.
+    fn without_leader(&self, body: Body) -> Statement {
+        Statement {
+            term: self.present.term,
+            epoch: None,
+            hears_you: true,
+            body,
+        }
+    }
+}
+
+fn status(over: Option<&Epoch>, no_login: &[&NodeName]) -> Body {
+    Body::Status {
+        over: over.cloned(),
+        no_login: no_login.iter().copied().cloned().collect(),
+    }
+}
+
+fn claim(round: u64, after: Option<&Epoch>) -> Body {
+    Body::Beat {
+        every_ms: 50,
+        round,
+        followers: 200,
+        after: after.cloned(),
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    }
+}
+
+/// Every message of the election, with what can be false in it.
+const LIES: [Lie; 16] = [
+    Lie {
+        message: "status",
+        lie: "follows a later leadership of another node",
+        claims: false,
+        state: |scene| scene.of_next(&scene.other, status(None, &[])),
+    },
+    Lie {
+        message: "status",
+        lie: "the present leadership is over",
+        claims: false,
+        state: |scene| scene.without_leader(status(Some(&scene.present), &[])),
+    },
+    Lie {
+        message: "status",
+        lie: "no login at the leader's broker and another",
+        claims: false,
+        state: |scene| scene.of_present(status(None, &[&scene.present.leader, &scene.other])),
+    },
+    Lie {
+        message: "status",
+        lie: "receives nobody",
+        claims: false,
+        state: |scene| Statement {
+            hears_you: false,
+            ..scene.of_present(status(None, &[]))
+        },
+    },
+    Lie {
+        message: "status",
+        lie: "the largest term",
+        claims: false,
+        state: |scene| Statement {
+            term: MAX_TERM,
+            ..scene.of_present(status(None, &[]))
+        },
+    },
+    Lie {
+        message: "ask",
+        lie: "has no leader, all the time",
+        claims: false,
+        state: |scene| scene.without_leader(Body::Ask { ask: scene.seq }),
+    },
+    Lie {
+        message: "vouch",
+        lie: "received the leader just now",
+        claims: false,
+        state: |scene| {
+            scene.of_present(Body::LeaderEvidence {
+                ask: scene.seq % 100,
+                age_ms: 0,
+                life: scene.life.clone(),
+            })
+        },
+    },
+    Lie {
+        message: "vouch",
+        lie: "received another node, which leads",
+        claims: false,
+        state: |scene| {
+            let body = Body::LeaderEvidence {
+                ask: scene.seq % 100,
+                age_ms: 0,
+                life: LifeSign::default(),
+            };
+            scene.of_next(&scene.other, body)
+        },
+    },
+    Lie {
+        message: "beat",
+        lie: "leads, with 200 followers",
+        claims: true,
+        state: |scene| scene.of_next(&scene.liar, claim(1, None)),
+    },
+    Lie {
+        message: "beat",
+        lie: "leads after the present leader",
+        claims: true,
+        state: |scene| scene.of_next(&scene.liar, claim(1, Some(&scene.present))),
+    },
+    Lie {
+        message: "beat",
+        lie: "leads, and does not receive the leader",
+        claims: true,
+        state: |scene| Statement {
+            hears_you: false,
+            ..scene.of_next(&scene.liar, claim(1, Some(&scene.present)))
+        },
+    },
+    Lie {
+        message: "beat",
+        lie: "leads, in the largest round",
+        claims: true,
+        state: |scene| scene.of_next(&scene.liar, claim(MAX_ROUND, Some(&scene.present))),
+    },
+    Lie {
+        message: "offer",
+        lie: "wants to hand over a lead that it does not have",
+        claims: false,
+        state: |scene| scene.of_present(Body::Offer),
+    },
+    Lie {
+        message: "ready",
+        lie: "is about to lead",
+        claims: false,
+        state: |scene| scene.of_present(Body::Ready),
+    },
+    Lie {
+        message: "yield",
+        lie: "hands over a lead that it does not have, in the largest round",
+        claims: false,
+        state: |scene| {
+            scene.of_present(Body::Yield {
+                last_round: MAX_ROUND,
+            })
+        },
+    },
+    Lie {
+        message: "resign",
+        lie: "ends a leadership of its own, far ahead",
+        claims: false,
+        state: |scene| {
+            let term = scene.present.term + MAX_TERM_STEP / 2;
+            let epoch = Epoch::new(term, scene.liar.clone());
+            let body = Body::Resign {
+                epoch,
+                last_round: 0,
+            };
+            Statement {
+                term,
+                ..scene.without_leader(body)
+            }
+        },
+    },
+];
+
+/// The worst outcomes of one lie.
+#[derive(Clone, Copy, Default)]
+struct Outcome {
+    cells: u64,
+    /// Longest time without a map at an honest vehicle in µs, while the leader works and after it hangs.
+    longest_gap: [u64; 2],
+    /// Most changes of leadership while the leader works.
+    changes: usize,
+}
+
+/// Longest time without a map at an honest vehicle.
+const MAX_GAP: u64 = SECOND;
+
+/// A member sends one kind of false message for seconds, while the leader works, and then while it hangs: no honest
+/// vehicle is without maps for a second, and every map that it accepts is judged. Prints the table of messages and lies.
+#[test]
+fn no_lie_of_a_member_costs_a_vehicle_its_maps() {
+    let mut outcomes = [Outcome::default(); LIES.len()];
+    for_seeds(seeds(), |seed| {
+        let number = seed as usize % LIES.len();
+        if let Some(outcome) = outcome_of(&LIES[number], seed / LIES.len() as u64) {
+            let worst = &mut outcomes[number];
+            worst.cells += 1;
+            worst.changes = worst.changes.max(outcome.changes);
+            for (worst, gap) in worst.longest_gap.iter_mut().zip(outcome.longest_gap) {
+                *worst = gap.max(*worst);
+            }
+        }
+    });
+    println!(
+        "| message | false statement | cells | changes of leadership | longest gap in ms | with a hung leader |"
+    );
+    println!("|---|---|---|---|---|---|");
+    for (lie, outcome) in LIES.iter().zip(outcomes) {
+        let Lie {
+            message,
+            lie,
+            claims,
+            ..
+        } = lie;
+        let Outcome {
+            cells,
+            longest_gap,
+            changes,
+        } = outcome;
+        let [gap, hung_gap] = longest_gap.map(|gap| (gap / MS).to_string());
+        let hung_gap = if *claims {
+            "leads".to_owned()
+        } else {
+            hung_gap
+        };
+        println!("| `{message}` | {lie} | {cells} | {changes} | {gap} | {hung_gap} |");
+    }
+}
+
+/// Outcome of a lie in one cell; `None` in a cell too small or too large for it.
+fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
+    let mut world = cell(seed);
+    if !(3..=8).contains(&world.nodes.len()) {
+        return None;
+    }
+    start_all(&mut world);
+    let mut outcome = None;
+    check(&mut world, seed, |world| {
+        world.run_for(9 * SECOND);
+        one_best_leader(world)?;
+        let leader = world.leaders()[0];
+        let standby = world.nodes[leader].standby().cloned();
+        let others: Vec<usize> = (0..world.nodes.len())
+            .filter(|node| *node != leader)
+            .collect();
+        // Some honest node takes over. A standby that stays silent is another fault.
+        let may_lie =
+            |world: &World, liar: usize| Some(&world.nodes[liar].name) != standby.as_ref();
+        let liars: Vec<usize> = others
+            .into_iter()
+            .filter(|node| may_lie(world, *node))
+            .collect();
+        if standby.is_none() || liars.is_empty() {
+            return Ok(());
+        }
+        let liar = liars[world.random.index(liars.len())];
+        let life = life_of(world, leader);
+        let mut longest_gap = [0; 2];
+        let before = world.led.len();
+        let mut seq = FORGED;
+        let mut lie_for = |world: &mut World, micros: u64| {
+            let end = world.now + micros;
+            while world.now < end {
+                seq += 1;
+                tell(world, lie, (liar, leader), seq, &life);
+                world.run_for(10 * MS);
+            }
+        };
+        let from = world.now;
+        lie_for(world, 3 * SECOND);
+        ensure(world.nodes[leader].leads(), "the leader gave way")?;
+        let changes = world.led.len() - before;
+        longest_gap[0] = longest_gap_of(world, &[liar, leader], from)?;
+        // A candidate that claims the lead of a hung leader gets it.
+        if !lie.claims {
+            world.plan(
+                0,
+                Fault::Pause {
+                    node: leader,
+                    micros: 20 * SECOND,
+                },
+            );
+            let from = world.now;
+            lie_for(world, 3 * SECOND);
+            longest_gap[1] = longest_gap_of(world, &[liar, leader], from)?;
+        }
+        let longest = longest_gap[0].max(longest_gap[1]);
+        ensure(
+            longest <= MAX_GAP,
+            &format!("{}: {}: {longest} µs without a map", lie.message, lie.lie),
+        )?;
+        outcome = Some(Outcome {
+            cells: 1,
+            longest_gap,
+            changes,
+        });
+        Ok(())
+    });
+    outcome
+}
+
+/// The longest time without a map since `from` at all nodes but these.
+fn longest_gap_of(world: &World, but: &[usize], from: u64) -> Result<u64, String> {
+    let mut longest = 0;
+    for (_, node) in world.alive().filter(|(index, _)| !but.contains(index)) {
+        let accepted = node.accepted.iter().map(|map| map.at);
+        let before = accepted.clone().filter(|at| *at <= from).max();
+        let times = before.into_iter().chain(accepted.filter(|at| *at > from));
+        let times: Vec<u64> = times.chain([world.now]).collect();
+        ensure(times.len() > 2, &format!("{} gets no maps", node.name))?;
+        let gaps = times.windows(2).map(|pair| pair[1] - pair[0]);
+        longest = longest.max(gaps.max().unwrap_or(0));
+    }
+    Ok(longest)
+}
+
+/// The last sign of life of a leader.
+fn life_of(world: &World, leader: usize) -> LifeSign {
+    let epoch = world.nodes[leader]
+        .election()
+        .and_then(|election| election.epoch().cloned());
+    let began = world
+        .led
+        .iter()
+        .rev()
+        .find(|(_, led)| Some(led) == epoch.as_ref())
+        .map_or(world.now, |(began, _)| *began);
+    LifeSign {
+        led_ms: (world.now - began) / MS,
+        signature: None,
+    }
+}
+
+/// Sends every honest node the same lie, one of all kinds.
+fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
+    let lie = loop {
+        let lie = &LIES[world.random.index(LIES.len())];
+        // A leader that nobody follows makes way for one that does not hear it.
+        if world.nodes.len() > 2 || lie.lie != "leads, and does not receive the leader" {
+            break lie;
+        }
+    };
+    tell(world, lie, (liar, leader), seq, &LifeSign::default());
+}
+
+/// Sends every honest node a lie.
+fn tell(world: &mut World, lie: &Lie, (liar, leader): (usize, usize), seq: u64, life: &LifeSign) {
+    let Some(present) = world.nodes[leader]
+        .election()
+        .and_then(|election| election.epoch().cloned())
+    else {
+        return;
+    };
+    let other = world.random.index(world.nodes.len());
+    let name = world.nodes[liar].name.clone();
+    let scene = Scene {
+        liar: name.clone(),
+        present,
+        life: life.clone(),
+        other: world.nodes[other].name.clone(),
+        seq,
+    };
+    let Statement {
+        term,
+        epoch,
+        hears_you,
+        body,
+    } = (lie.state)(&scene);
+    let ElectionConfig { role, priority, .. } = world.nodes[liar].config;
+    let message = ElectionMessage {
+        schema: SCHEMA_VERSION,
+        from: name.clone(),
+        run: 1_900_000_000_000_000,
+        seq,
+        candidacy: Candidacy {
+            role,
+            priority,
+            load: 0,
+            fit: true,
+        },
+        term,
+        epoch,
+        hears_you,
+        body,
+        clock: None,
+        description: None,
+    };
+    for to in (0..world.nodes.len()).filter(|to| *to != liar) {
+        if world.nodes[to].paused_until > world.now {
+            continue;
+        }
+        let (from, message) = (name.clone(), message.clone());
+        // As in its certificate.
+        let rights = Rights {
+            role,
+            priority,
+            may_describe: false,
+        };
+        world.handle(
+            to,
+            Input::Receive {
+                from,
+                rights,
+                message,
+            },
+        );
+    }
+}
