@@ -71,7 +71,7 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
 
 eval-generated: setup ## VOTE beside the majority on 200 generated label sets
-	cargo test --release --locked -p ecod --test vote_generated -- --include-ignored --nocapture
+	cargo test --release --locked -p ecod --test core vote::generated:: -- --include-ignored --nocapture
 
 eval-tracks: setup ## [measure] tracking in generated traffic beside single vehicles and late fusion; writes table and drawings in docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
@@ -111,30 +111,30 @@ monitoring: ## check the rules for Prometheus; takes promtool out of Debian's pa
 	packaging/check-monitoring
 
 sim: setup ## [check] simulated cells under faults: SEEDS=10000, or one with SEED=n
-	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
+	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election sim:: -- --nocapture
 
 sim-check: setup ## bugs put in by hand, each of which the simulated cells must find within SEEDS=1000 seeds
 	packaging/check-sim
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## [measure] gaps of real cells that are killed, stopped and cut off: TRIALS=20 SCENARIOS=a,b NODES=2,5
-	cargo test $(RELEASE) --locked --test trials -- --ignored --exact trials --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact failover::trials --nocapture
 
 joining: PACKAGES += iproute2 mosquitto-clients
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
-	cargo test --locked --test joining -- --ignored --exact machines::three_machines_become_a_cell_by_the_commands_of_the_readme
+	cargo test --locked --test trials -- --ignored --exact joining::machines::three_machines_become_a_cell_by_the_commands_of_the_readme
 
 clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
-	cargo test --release --locked --test clocks -- --ignored --exact all --nocapture
+	cargo test --release --locked --test trials -- --ignored --exact clocks::all --nocapture
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1
-	cargo test $(RELEASE) --locked --test trials -- --ignored --exact soak::soak --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact failover::soak::soak --nocapture
 
 attack: PACKAGES += iproute2
 attack: setup ## [measure] attackers of all kinds against real cells: ROWS=text selects rows, ATTACK=quick a part
-	cargo test $(RELEASE) --locked --test attacks -- --ignored --exact attacks --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact attacks::attacks --nocapture
 
 lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
@@ -169,10 +169,10 @@ recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
 	python3 -m venv $(BUILD)/recording-venv
 	$(BUILD)/recording-venv/bin/pip install --quiet mcap
-	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked --test recording -- --include-ignored --nocapture python
+	MCAP_PYTHON=$(abspath $(BUILD))/recording-venv/bin/python3 cargo test --locked --test programs -- --include-ignored --nocapture recording::python
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
-	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
+	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test programs recording::
 
 foxglove-check: PACKAGES += $(if $(shell command -v npm),,npm)
 foxglove-check: setup ## a camera's log against Foxglove's published schemas, and the layout against the log; installs npm where there is none
@@ -219,7 +219,7 @@ ros2-check: PACKAGES := build-essential ca-certificates python3-venv
 ros2-check: setup ## a node's log for ROS 2, read by mcap-ros2-support and written again to the same bytes by rosbags
 	python3 -m venv $(BUILD)/ros2-venv
 	$(BUILD)/ros2-venv/bin/pip install --quiet mcap-ros2-support rosbags
-	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked --test ros2 -- --include-ignored --nocapture
+	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked --test bridges ros2:: -- --include-ignored --nocapture
 
 dds-check: PACKAGES := build-essential ca-certificates iproute2 python3-venv
 dds-check: setup ## live topics of ROS 2 and a detector's, in a network of their own, against Cyclone DDS for Python; needs root

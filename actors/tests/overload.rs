@@ -1,4 +1,4 @@
-//! More comes in than is taken: nobody pays for it but who sends it.
+//! More comes in than is taken: nobody pays for it but who sends it. Alone in its process, whose memory is measured.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
