@@ -4,8 +4,9 @@
 //! reports count in the order of capture, whatever the order of arrival. `docs/tracks.md` has the equations.
 //!
 //! A vehicle needs no calibration beforehand. Its noise, field of view, detection rates, calibration and pose bias
-//! are estimated from what it has in common with the others. Received maps lend identities and no evidence: no track is
-//! spawned or kept alive by them.
+//! are estimated from what it has in common with the others. Maps of neighbouring cells lend
+//! identities; they spawn and keep no track. The last map of another aggregator of this cell spawns tracks whose existence
+//! fades.
 
 mod assignment;
 mod calibration;

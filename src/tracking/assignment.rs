@@ -47,8 +47,15 @@ const FAST_WITHIN: Duration = Duration::from_millis(250);
 /// or a vehicle fabricates them.
 const MAX_FAST: usize = 64;
 
-/// Maximum number of new hypotheses within the gate of a detection that are compared with it.
+/// Maximum number of new hypotheses in one square of the gate's side that are compared with a detection; nine squares are
+/// searched.
 const MAX_NEW_NEAR: usize = 16;
+
+/// Maximum number of tracks that are compared with a detection, the nearest first.
+const MAX_TRACKS_NEAR: usize = 64;
+
+/// Probability of a detection by a vehicle whose view is unknown.
+const UNKNOWN_RATE: f64 = 0.5;
 
 /// What may have caused detections of this instant.
 #[derive(Debug)]
@@ -142,11 +149,7 @@ impl<'a> Assignment<'a> {
             new: HashMap::new(),
         };
         let mut owners: Vec<Vec<usize>> = vec![Vec::new(); scans.len()];
-        let passes = if scans.len() > 1 {
-            PASSES as f64 as usize
-        } else {
-            1
-        };
+        let passes = if scans.len() > 1 { PASSES } else { 1 };
         for _ in 0..passes {
             for (scan, owners) in scans.iter().zip(&mut owners) {
                 assignment.assign(scan, owners);
@@ -184,7 +187,7 @@ impl<'a> Assignment<'a> {
         *owners = assigned
             .iter()
             .zip(&scan.detections)
-            .map(|(owner, detection)| owner.unwrap_or_else(|| self.open(detection)))
+            .map(|(owner, detection)| owner.unwrap_or_else(|| self.open(scan, detection)))
             .collect();
         if scan.is_trusted() {
             for (owner, information) in owners.iter().zip(&information) {
@@ -248,9 +251,8 @@ impl<'a> Assignment<'a> {
         let distance_squared = state
             .innovation(self.at, &detection.measurement)
             .distance_squared;
-        let is_possible =
-            distance_squared <= self.config.gate() && similarity > MIN_LABEL_SIMILARITY;
-        is_possible.then(|| self.config.gate() - distance_squared + similarity.ln())
+        let benefit = self.config.gate() - distance_squared + similarity.ln();
+        (benefit > 0.0 && similarity > MIN_LABEL_SIMILARITY).then_some(benefit)
     }
 
     /// The hypothesis of a track.
@@ -274,18 +276,22 @@ impl<'a> Assignment<'a> {
         let reach_m = self.config.gate_m + self.tracks.slack_m(self.at);
         let mut pairs = Vec::with_capacity(2 * scan.detections.len());
         for (number, detection) in scan.detections.iter().enumerate() {
-            let mut tracks: SmallVec<[TrackIndex; 16]> = SmallVec::new();
-            self.tracks
-                .near(&detection.measurement.position, reach_m, |indexed| {
-                    if self.tracks[indexed.track].vehicle != Some(scan.sensor) {
-                        tracks.push(indexed.track);
-                    }
-                });
+            let position = &detection.measurement.position;
+            let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
+            self.tracks.near(position, reach_m, |indexed| {
+                if self.tracks[indexed.track].vehicle != Some(scan.sensor) {
+                    tracks.push(((indexed.position - position).norm(), indexed.track));
+                }
+            });
+            if tracks.len() > MAX_TRACKS_NEAR {
+                tracks.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+                tracks.truncate(MAX_TRACKS_NEAR);
+            }
             let mut near: SmallVec<[usize; 16]> = tracks
                 .into_iter()
-                .map(|track| self.of_track(track))
+                .map(|(_, track)| self.of_track(track))
                 .collect();
-            self.new_near(&detection.measurement.position, &mut near);
+            self.new_near(position, &mut near);
             for hypothesis in near {
                 if let Some(benefit) = self.benefit(scan, detection, &self.hypotheses[hypothesis]) {
                     pairs.push(GatedPair {
@@ -320,11 +326,10 @@ impl<'a> Assignment<'a> {
         }
         let sensor = self.sensors.get(scan.sensor)?;
         let rates = sensor.coverage.rates_at(&detection.reported);
-        let rate = |state| rates.map_or(NEW_EXISTENCE, |rates| rates.rate(state));
+        let rate = |state| rates.map_or(UNKNOWN_RATE, |rates| rates.rate(state));
         let (detected, similarity) = match hypothesis.track.map(|track| &self.tracks[track]) {
             Some(track) => {
-                let history = track.history.get(scan.sensor);
-                let state = history.map_or(LookState::First, |history| history.state);
+                let state = track.history.state_of(scan.sensor);
                 (
                     track.existence.probability() * rate(state),
                     track.label_similarity(detection.object),
@@ -335,12 +340,12 @@ impl<'a> Assignment<'a> {
         let odds = detected.max(MIN_DETECTED) / (1.0 - detected).max(0.02);
         let new_per_m2 = detection.class.new_per_m2;
         let density = TAU * covariance.determinant().sqrt() * new_per_m2;
-        let benefit = (odds * similarity.powf(1.0) / density).ln() - distance_squared / 2.0;
+        let benefit = (odds * similarity / density).ln() - distance_squared / 2.0;
         (benefit > 0.0).then_some(benefit)
     }
 
-    /// A new hypothesis at a detection.
-    fn open(&mut self, detection: &ScannedDetection<'_>) -> usize {
+    /// A new hypothesis at a detection. Other vehicles may join it if it has information.
+    fn open(&mut self, scan: &Scan<'_>, detection: &ScannedDetection<'_>) -> usize {
         let square = self.square(&detection.measurement.position);
         let number = self.hypotheses.len();
         self.hypotheses.push(Hypothesis {
@@ -349,7 +354,9 @@ impl<'a> Assignment<'a> {
             information: Information::NONE,
             hits: SmallVec::new(),
         });
-        self.new.entry(square).or_default().push(number);
+        if scan.is_trusted() {
+            self.new.entry(square).or_default().push(number);
+        }
         number
     }
 

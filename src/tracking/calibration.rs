@@ -2,7 +2,7 @@
 //!
 //! Two histograms count the confidences of detections by the probability that their track is an object. That
 //! probability follows from the results of looks alone, so that confidences do not confirm themselves. Without
-//! evidence, a confidence is the probability that it states.
+//! evidence, a confidence is the probability that it states, relative to `even_confidence`.
 
 /// Estimated relation between confidence and evidence of one vehicle.
 #[derive(Debug, Clone)]

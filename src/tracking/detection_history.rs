@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use smallvec::SmallVec;
 
-use super::existence::SensorHistory;
+use super::existence::{LookState, SensorHistory};
 use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
@@ -37,6 +37,12 @@ impl DetectionHistory {
     /// The history of a vehicle that has a slot.
     pub(super) fn get(&self, sensor: SensorId) -> Option<&SensorHistory> {
         self.slot_of(sensor).map(|slot| &self.histories[slot])
+    }
+
+    /// State of a vehicle before its next look.
+    pub(super) fn state_of(&self, sensor: SensorId) -> LookState {
+        self.get(sensor)
+            .map_or(LookState::First, |history| history.state)
     }
 
     /// Whether a vehicle has a slot or can have one.

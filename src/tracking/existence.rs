@@ -26,7 +26,7 @@ const CORRELATION: f64 = 0.3;
 /// Share of the evidence of confidences that is independent from vehicle to vehicle.
 const CONFIDENCE_WEIGHT: f64 = 0.7;
 
-/// Maximum log-odds of existence by the results of looks, for and against.
+/// Maximum log-odds of existence by the results of looks; the minimum is twice its negative.
 const MAX_NATS: f64 = 6.0;
 
 /// Maximum evidence of the looks of one vehicle in the judgement of another, nats.
@@ -207,9 +207,14 @@ impl Existence {
         self.log_odds = self.log_odds.max(LATENT_NATS);
     }
 
+    /// The log-odds at the time of the last prediction.
+    pub(super) fn log_odds(&self) -> f64 {
+        self.log_odds
+    }
+
     /// Raises the log-odds to a minimum.
     pub(super) fn raise(&mut self, log_odds: f64) {
-        self.log_odds = self.log_odds.max(log_odds);
+        self.log_odds = self.log_odds.max(log_odds.min(MAX_NATS));
     }
 
     /// The probability.

@@ -193,7 +193,8 @@ impl KinematicState {
     }
 
     /// Adapts the covariance to a manoeuvre: a normalised innovation of `excess` times the expected one means that the
-    /// state is that much less certain (fading memory; Bar-Shalom et al. 2001, section 11.2).
+    /// state is that much less certain (fading memory; Bar-Shalom et al. 2001, section 11.2), and the velocity may have
+    /// changed as much as within a second.
     pub(super) fn adapt(&mut self, excess: f64) {
         self.pp *= excess;
         self.pv *= excess;

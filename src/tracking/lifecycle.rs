@@ -15,6 +15,7 @@ use super::population::Population;
 use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::track::Track;
+use super::update::VELOCITY_SIGMA_MPS;
 use crate::model::geometry::Covariance;
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport};
@@ -24,6 +25,9 @@ pub(super) const MERGE_M: f64 = 2.0;
 
 /// The same in metres if their labels differ: people get in and out of cars, and stand beside each other.
 const MERGE_UNLIKE_M: f64 = 1.0;
+
+/// Maximum number of later tracks that are compared with each.
+const MAX_NEAR_EACH: usize = 32;
 
 /// The same in standard deviations.
 const MERGE_SIGMAS: f64 = 3.0;
@@ -74,9 +78,14 @@ fn near_pairs(
     let mut pairs = Vec::new();
     for (older, track) in tracks.indexed() {
         let position = track.state.position_at(now);
+        let mut others = 0;
         tracks.near(&position, MERGE_M, |indexed| {
             let later = indexed.track;
-            if later > older && may_be_one(track, &tracks[later], now, config) {
+            if later > older
+                && others < MAX_NEAR_EACH
+                && may_be_one(track, &tracks[later], now, config)
+            {
+                others += 1;
                 pairs.push((older, later));
             }
         });
@@ -115,7 +124,7 @@ pub(super) fn prune(
             if track.is_settled {
                 population.leave();
             } else {
-                population.settle(false);
+                sensors.settle(track.spawned_by, false);
             }
         }
         is_kept
@@ -157,7 +166,9 @@ pub(super) fn adopt_map(
         let class = ObjectClass::of(&object.label, config);
         let mut track = Track::new(object.id, now, &measurement, class);
         if let Some([x, y]) = object.velocity_mps {
-            track.state.update_velocity(now, Vector2::new(x, y), 1.0);
+            track
+                .state
+                .update_velocity(now, Vector2::new(x, y), VELOCITY_SIGMA_MPS);
         }
         track.state.limit_speed();
         track.inherit(object, now);

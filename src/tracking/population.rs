@@ -1,48 +1,36 @@
-//! Births and departures of objects in the whole cell, estimated from the tracks.
+//! Births and departures of objects, estimated from the tracks.
 
-/// Which share of new tracks become objects, and how long objects stay.
+/// Share of the tracks that one vehicle begins that become objects.
 #[derive(Debug, Clone)]
-pub(super) struct Population {
-    /// Tracks that became objects, and those that did not.
+pub(super) struct Births {
+    /// Tracks that became objects.
     objects: f64,
+    /// Tracks that ended before.
     clutter: f64,
-    /// Objects that left, and seconds for which objects stayed.
-    departures: f64,
-    stayed_s: f64,
 }
 
-impl Default for Population {
+impl Default for Births {
     fn default() -> Self {
         Self {
-            objects: Self::USUAL_SHARE * Self::USUAL_BIRTHS,
-            clutter: (1.0 - Self::USUAL_SHARE) * Self::USUAL_BIRTHS,
-            departures: Self::USUAL_TIME_S / Self::USUAL_STAY_S,
-            stayed_s: Self::USUAL_TIME_S,
+            objects: Self::USUAL_SHARE * Self::USUAL,
+            clutter: (1.0 - Self::USUAL_SHARE) * Self::USUAL,
         }
     }
 }
 
-impl Population {
-    /// Usual share of new tracks that become objects, and the number of births as which it counts.
+impl Births {
+    /// Usual share of new tracks that become objects.
     const USUAL_SHARE: f64 = 0.5;
-    const USUAL_BIRTHS: f64 = 4.0;
 
-    /// Usual stay of an object in seconds, and the time in seconds as which it counts.
-    const USUAL_STAY_S: f64 = 15.0;
-    const USUAL_TIME_S: f64 = 60.0;
+    /// Number of births as which the usual share counts.
+    const USUAL: f64 = 4.0;
 
-    /// Number of births, and time in seconds, beyond which earlier ones are discounted.
-    const MAX_BIRTHS: f64 = 400.0;
-    const MAX_TIME_S: f64 = 3000.0;
+    /// Number of births beyond which earlier ones are discounted.
+    const MAX: f64 = 400.0;
 
     /// Log-odds that a new track is an object.
-    pub(super) fn birth_log_odds(&self) -> f64 {
+    pub(super) fn log_odds(&self) -> f64 {
         (self.objects / self.clutter).ln().clamp(-4.0, 3.0)
-    }
-
-    /// Rate at which objects leave, per second.
-    pub(super) fn leaving_hz(&self) -> f64 {
-        self.departures / self.stayed_s
     }
 
     /// Counts a track that turned out to be an object, or clutter.
@@ -52,9 +40,43 @@ impl Population {
         } else {
             self.clutter += 1.0;
         }
-        let kept = (Self::MAX_BIRTHS / (self.objects + self.clutter)).min(1.0);
+        let kept = (Self::MAX / (self.objects + self.clutter)).min(1.0);
         self.objects *= kept;
         self.clutter *= kept;
+    }
+}
+
+/// How long objects stay in the cell.
+#[derive(Debug, Clone)]
+pub(super) struct Population {
+    /// Objects that left.
+    departures: f64,
+    /// Seconds for which objects stayed.
+    stayed_s: f64,
+}
+
+impl Default for Population {
+    fn default() -> Self {
+        Self {
+            departures: Self::USUAL_TIME_S / Self::USUAL_STAY_S,
+            stayed_s: Self::USUAL_TIME_S,
+        }
+    }
+}
+
+impl Population {
+    /// Usual stay of an object in seconds.
+    const USUAL_STAY_S: f64 = 15.0;
+
+    /// Time in seconds as which the usual stay counts.
+    const USUAL_TIME_S: f64 = 60.0;
+
+    /// Time in seconds beyond which earlier stays are discounted.
+    const MAX_TIME_S: f64 = 3000.0;
+
+    /// Rate at which objects leave, per second.
+    pub(super) fn leaving_hz(&self) -> f64 {
+        self.departures / self.stayed_s
     }
 
     /// Counts the seconds for which objects stayed, added up.

@@ -11,6 +11,7 @@ use super::config::TracksConfig;
 use super::coverage::Coverage;
 use super::existence::{DetectionRates, LookRates, LookState};
 use super::handles::SensorId;
+use super::population::Births;
 use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::names::NodeName;
@@ -159,6 +160,20 @@ impl Sensors {
         }
     }
 
+    /// Counts what became of a track that a vehicle began.
+    pub(super) fn settle(&mut self, spawned_by: Option<SensorId>, is_object: bool) {
+        if let Some(sensor) = spawned_by.and_then(|vehicle| self.get_mut(vehicle)) {
+            sensor.births.settle(is_object);
+        }
+    }
+
+    /// Sets the pose biases of all vehicles back to none.
+    pub(super) fn reset_pose_biases(&mut self, at: Timestamp, config: &TracksConfig) {
+        for sensor in self.iter_mut() {
+            sensor.pose_bias = PoseBias::new(at, &config.bias_prior());
+        }
+    }
+
     /// Forgets the vehicles whose last report is before `limit`, but for their counts; true if there were any.
     pub(super) fn forget_silent(&mut self, limit: Timestamp) -> bool {
         let is_silent = |model: &mut Box<SensorModel>| model.last_report < limit;
@@ -192,6 +207,7 @@ pub(super) struct SensorModel {
     pub(super) calibration: DetectionCalibration,
     pub(super) coverage: Coverage,
     pub(super) clutter: DetectionRates,
+    pub(super) births: Births,
     pub(super) counts: TrustCounts,
 }
 
@@ -214,6 +230,7 @@ impl SensorModel {
             calibration: DetectionCalibration::new(config.even_confidence),
             coverage: Coverage::default(),
             clutter: DetectionRates::clutter(),
+            births: Births::default(),
             counts,
         }
     }
@@ -410,7 +427,9 @@ impl NoiseModel {
         if let Some(stated) = object.covariance() {
             let stated = (stated.xx + stated.yy) / 2.0;
             let squared = bounded(offset.norm_squared() / 2.0, self.scale() * stated);
-            self.scale.learn(squared / stated);
+            if stated > 0.0 {
+                self.scale.learn(squared / stated);
+            }
             return;
         }
         let from = origin.map(|origin| Vector2::new(object.x_m, object.y_m) - origin);

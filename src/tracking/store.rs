@@ -22,6 +22,8 @@ pub(super) struct TrackStore {
     fastest_mps: f64,
     /// The track of each vehicle that reports its pose.
     of_vehicle: HashMap<SensorId, TrackIndex>,
+    /// Number of unconfirmed tracks by the vehicle that began them.
+    unconfirmed: HashMap<SensorId, usize>,
     max_tracks: usize,
     max_density: usize,
     gate_m: f64,
@@ -32,6 +34,9 @@ pub(super) struct TrackStore {
 /// Minimum side of a grid cell in metres. Trade-off: larger cells return more false candidates; smaller cells cost more
 /// look-ups.
 const MIN_CELL_M: f64 = 24.0;
+
+/// A vehicle's unconfirmed tracks take at most one of so many shares of the room for tracks.
+const SHARES: usize = 4;
 
 impl TrackStore {
     /// An empty store.
@@ -48,6 +53,7 @@ impl TrackStore {
             indexed_at: Timestamp(0),
             fastest_mps: 0.0,
             of_vehicle: HashMap::new(),
+            unconfirmed: HashMap::new(),
             max_tracks,
             max_density,
             gate_m,
@@ -95,9 +101,16 @@ impl TrackStore {
     /// Adds a track unless there is no room for it.
     pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
         let crowd = self.grid.crowd(&track.state.position, self.gate_m);
-        if self.tracks.len() >= self.max_tracks || crowd >= self.max_density {
+        let of_spawner = track
+            .spawned_by
+            .and_then(|vehicle| self.unconfirmed.get(&vehicle));
+        let has_share = of_spawner.is_none_or(|tracks| *tracks < self.max_tracks.div_ceil(SHARES));
+        if self.tracks.len() >= self.max_tracks || crowd >= self.max_density || !has_share {
             self.refused += 1;
             return None;
+        }
+        if let Some(vehicle) = track.spawned_by {
+            *self.unconfirmed.entry(vehicle).or_default() += 1;
         }
         let index = TrackIndex(self.tracks.len() as u32);
         self.grid.insert(track.indexed(index, self.indexed_at));
@@ -120,6 +133,9 @@ impl TrackStore {
             self.of_vehicle
                 .extend(track.vehicle.map(|vehicle| (vehicle, index)));
             self.grid.insert(track.indexed(index, at));
+            if let Some(vehicle) = track.spawned_by.filter(|_| !track.is_confirmed()) {
+                *self.unconfirmed.entry(vehicle).or_default() += 1;
+            }
         }
     }
 
@@ -195,12 +211,14 @@ impl TrackStore {
         for track in &mut self.tracks {
             track.history.retain(&known);
             track.vehicle = track.vehicle.filter(|vehicle| known(*vehicle));
+            track.spawned_by = track.spawned_by.filter(|vehicle| known(*vehicle));
         }
         self.of_vehicle.clear();
     }
 
     fn clear_indexes(&mut self) {
         self.grid.clear();
+        self.unconfirmed.clear();
         self.of_vehicle.clear();
     }
 }

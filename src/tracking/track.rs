@@ -64,6 +64,8 @@ pub(super) struct Track {
     pub(super) existence: Existence,
     /// True if the last look of any vehicle was a detection.
     is_detected: bool,
+    /// The vehicle whose detection began the track.
+    pub(super) spawned_by: Option<SensorId>,
     /// True if the track has been counted as an object.
     pub(super) is_settled: bool,
     /// The vehicle that this track is, by its reported pose.
@@ -95,6 +97,7 @@ impl Track {
             last_seen: at,
             existence: Existence::new(f64::NEG_INFINITY, at),
             is_detected: true,
+            spawned_by: None,
             is_settled: false,
             vehicle: None,
             hits: 0,
@@ -240,6 +243,9 @@ impl Track {
             self.state = other.state;
             self.last_seen = other.last_seen;
         }
+        self.existence.raise(other.existence.log_odds());
+        self.is_settled |= other.is_settled;
+        self.is_detected |= other.is_detected;
         self.hits = self.hits.saturating_add(other.hits);
         self.vehicle = self.vehicle.or(other.vehicle);
         self.heading_rad = self.heading_rad.or(other.heading_rad);

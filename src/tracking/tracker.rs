@@ -66,6 +66,9 @@ impl Tracker {
     pub(crate) fn configured(mut self, config: TracksConfig, reputation: ReputationConfig) -> Self {
         self.tracks.configure(&config);
         self.sensors.fleet.configure(reputation);
+        if self.config.align && !config.align {
+            self.sensors.reset_pose_biases(self.closed_at, &config);
+        }
         Self { config, ..self }
     }
 

@@ -1,8 +1,8 @@
 //! Trust in vehicles: which of them report objects that others see, and which fabricate or hide objects.
 //!
 //! Every [`JUDGED_AFTER`] of looks, a vehicle's statement about an object is compared with the evidence of the others.
-//! Where they agree that the object exists, a detection is correct; never to have detected it is a miss if most
-//! vehicles detect objects at that distance. Where at least two others look and agree that nothing exists, a detection
+//! Where they agree that the object exists, a detection is correct; not to have detected it since the last judgement is a
+//! miss if most vehicles detect objects at that distance. Where at least two others look and agree that nothing exists, a detection
 //! is a false positive. One vehicle against another settles nothing.
 
 use std::collections::BTreeMap;

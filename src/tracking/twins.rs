@@ -13,7 +13,7 @@ use super::detection_history::DetectionHistory;
 use super::existence::SensorHistory;
 use crate::model::time::Timestamp;
 
-/// Log-odds from which two tracks are one object. Below their negative, further looks change nothing.
+/// Log-odds from which two tracks are one object. Below twice their negative, further looks change nothing.
 const TWIN_NATS: f64 = 5.0;
 
 /// Probability that a detector reports one object twice in a frame.

@@ -14,7 +14,7 @@ use super::foreign::ForeignObjects;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
-use super::population::Population;
+use super::population::{Births, Population};
 use super::registration::{RegistrationFrame, RegistrationSample};
 use super::scan::{Scan, ScannedDetection};
 use super::sensors::{Residual, SensorModel, Sensors};
@@ -26,7 +26,7 @@ use crate::reputation::Evidence;
 use crate::wire::{ObjectReport, PerceivedObject};
 
 /// Standard deviation of reported velocities, m/s.
-const VELOCITY_SIGMA_MPS: f64 = 1.0;
+pub(super) const VELOCITY_SIGMA_MPS: f64 = 1.0;
 
 /// Normalised innovation squared, of two dimensions, above which an object manoeuvres.
 const MANOEUVRE: f64 = 5.0;
@@ -163,8 +163,8 @@ impl InstantUpdate<'_> {
         if is_in_reach {
             track.state.update(at, &measurement);
             track.state.limit_speed();
-        } else if at >= track.state.at {
-            // The vehicle is new or has jumped; no other vehicle can have seen it here before.
+        } else if known.is_some() && at >= track.state.at {
+            // The vehicle has jumped; no other vehicle can have seen it here before.
             track.state = KinematicState::new(at, &measurement, class);
             track.history.clear();
         }
@@ -194,9 +194,7 @@ impl InstantUpdate<'_> {
                     continue;
                 };
                 let place = scan.detections[detection].reported;
-                let state = history
-                    .get(scan.sensor)
-                    .map_or(LookState::First, |history| history.state);
+                let state = history.state_of(scan.sensor);
                 looks.push(Look {
                     track,
                     scan: number,
@@ -240,7 +238,7 @@ impl InstantUpdate<'_> {
             let place = indexed.position + indexed.velocity * since_indexed_s;
             let track = &self.tracks[indexed.track];
             let history = track.history.get(scan.sensor);
-            let state = history.map_or(LookState::First, |history| history.state);
+            let state = track.history.state_of(scan.sensor);
             let Some(rates) = sensor.look_rates(&place, state) else {
                 return;
             };
@@ -294,6 +292,10 @@ impl InstantUpdate<'_> {
                 .iter()
                 .map(|(scan, detection)| (&scans[*scan], &scans[*scan].detections[*detection]))
         };
+        // Without trusted detections, what remains of the information is a rounding error.
+        if hits().all(|(scan, _)| !scan.is_trusted()) {
+            return;
+        }
         let track = &mut self.tracks[index];
         let Some((position, independent)) = hypothesis.detected() else {
             return;
@@ -413,7 +415,7 @@ impl InstantUpdate<'_> {
         let exists = track.existence.probability();
         if track.is_confirmed() && exists > CERTAIN && !track.is_settled {
             track.is_settled = true;
-            self.population.settle(true);
+            self.sensors.settle(track.spawned_by, true);
         }
         let is_hit = look.detection.is_some();
         let is_evident = track.is_confirmed()
@@ -484,10 +486,7 @@ impl InstantUpdate<'_> {
         };
         for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
             let position = foreign.state.position_at(at);
-            let state = foreign
-                .history
-                .get(id)
-                .map_or(LookState::First, |history| history.state);
+            let state = foreign.history.state_of(id);
             let near = scan.detections.iter().filter(|detection| {
                 let innovation = foreign.state.innovation(at, &detection.measurement);
                 // Its place is as old as its cell's map.
@@ -560,7 +559,10 @@ impl InstantUpdate<'_> {
         };
         let object = Some(detection.object);
         let mut track = self.begin(&measurement, first.report, detection.index, object);
-        let mut log_odds = self.population.birth_log_odds();
+        track.spawned_by = Some(first.sensor);
+        let spawner = self.sensors.get(first.sensor);
+        let births = spawner.map_or_else(Births::default, |sensor| sensor.births.clone());
+        let mut log_odds = births.log_odds();
         for (number, (scan, detection)) in hits().enumerate() {
             let Some(sensor) = self.sensors.get(scan.sensor) else {
                 continue;
@@ -574,8 +576,8 @@ impl InstantUpdate<'_> {
             log_odds += scan.trust * nats;
             describe(&mut track, detection, sensor, at);
             if let Some(history) = track.history.for_hit(scan.sensor, at) {
-                history.hit(at, position, nats, detection.confidence_nats);
-                history.position = detection.measurement.position;
+                let own_position = detection.measurement.position;
+                history.hit(at, own_position, nats, detection.confidence_nats);
             }
         }
         for scan in scans {
