@@ -40,25 +40,21 @@ impl Seeking {
     }
 }
 
-/// The latest questions. Evidence is dated from the question that it answers, so stale evidence
+/// The latest questions that this node asked for itself. Evidence is dated from the question that it answers, so stale evidence
 /// cannot circulate.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Questions {
     count: u64,
     recent: VecDeque<(u64, Timestamp)>,
-    /// Time of the latest question that this node asked for itself, and not for another node.
-    own_at: Timestamp,
 }
 
 impl Questions {
     const KEPT: usize = 8;
 
-    fn ask(&mut self, now: Timestamp) -> u64 {
+    /// Number of a question that is passed on to the leader. The leader answers it by a beat, so no
+    /// evidence is dated from it.
+    fn ask_for_another(&mut self) -> u64 {
         self.count += 1;
-        self.recent.push_back((self.count, now));
-        if self.recent.len() > Self::KEPT {
-            self.recent.pop_front();
-        }
         self.count
     }
 
@@ -70,12 +66,19 @@ impl Questions {
     }
 
     fn ask_for_itself(&mut self, now: Timestamp) -> u64 {
-        self.own_at = now;
-        self.ask(now)
+        self.count += 1;
+        self.recent.push_back((self.count, now));
+        if self.recent.len() > Self::KEPT {
+            self.recent.pop_front();
+        }
+        self.count
     }
 
+    /// Time of the latest question that this node asked for itself.
     pub(super) fn own_at(&self) -> Timestamp {
-        self.own_at
+        self.recent
+            .back()
+            .map_or_else(Timestamp::default, |(_, at)| *at)
     }
 }
 
@@ -161,8 +164,8 @@ impl Election {
                 self.waiting_questions.retain(|(other, _)| other != from);
                 if leader != *from && self.waiting_questions.len() < MAX_WAITING_QUESTIONS {
                     self.waiting_questions.push((from.clone(), ask));
-                    let own = self.questions.ask(now);
-                    self.send(&leader, Body::Ask { ask: own }, now);
+                    let ask = self.questions.ask_for_another();
+                    self.send(&leader, Body::Ask { ask }, now);
                 }
             }
             State::Following(_) | State::Seeking(_) => {}

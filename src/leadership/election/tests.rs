@@ -873,14 +873,33 @@ fn questions_of_other_nodes_do_not_delay_the_own_question() {
         };
         euclid.handle(accepted, at(100 * (round - 1)));
     }
-    let asks = |effects: Vec<ElectionEffect>| {
-        let is_question = |effect: &ElectionEffect| {
-            matches!(effect, ElectionEffect::Send { to, message }
-                if *to == edge && matches!(message.body, Body::Ask { .. }))
+    let asked = |effects: Vec<ElectionEffect>| {
+        let question = |effect: &ElectionEffect| match effect {
+            ElectionEffect::Send { to, message } if *to == edge => match message.body {
+                Body::Ask { ask } => Some(ask),
+                _ => None,
+            },
+            _ => None,
         };
-        effects.iter().any(is_question)
+        effects.iter().find_map(question)
     };
-    let question = received(&gauss, 1, Some(&epoch), Body::Ask { ask: 1 });
-    assert!(asks(euclid.handle(question, at(440))), "it is passed on");
-    assert!(asks(euclid.tick(at(451))));
+    let question = |seq| received(&gauss, seq, Some(&epoch), Body::Ask { ask: seq });
+    let passed_on = asked(euclid.handle(question(1), at(440)));
+    assert!(passed_on.is_some());
+    let ask = asked(euclid.tick(at(451))).expect("its own question");
+    // However many more it passes on, the answer to its own counts.
+    for seq in 2..20 {
+        euclid.handle(question(seq), at(460));
+    }
+    let evidence = Body::LeaderEvidence {
+        ask,
+        age_ms: 0,
+        life: LifeSign {
+            led_ms: 460,
+            ..LifeSign::default()
+        },
+    };
+    euclid.handle(received(&gauss, 20, Some(&epoch), evidence), at(470));
+    euclid.tick(at(560));
+    assert_eq!(euclid.leader(), Some(&edge));
 }
