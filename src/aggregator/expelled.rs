@@ -12,18 +12,22 @@ use crate::wire::FusedObject;
 /// their last detection.
 const MEMORY: Duration = Duration::from_secs(60);
 
+/// Time for which reports of an expelled vehicle may still arrive, and by which its stamps may be
+/// ahead.
+const GRACE: Duration = Duration::from_millis(500);
+
 /// Expelled vehicles, each with the time of its expulsion.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Expelled(BTreeMap<NodeName, Timestamp>);
 
 impl Expelled {
-    /// Adds a vehicle. Reports that it makes later, with a new certificate, count.
+    /// Adds a vehicle. Reports that it makes after [`GRACE`], with a new certificate, count.
     pub(super) fn add(&mut self, vehicle: NodeName, now: Timestamp) {
         self.0.insert(vehicle, now);
     }
 
-    /// Removes the objects that no other vehicle has detected, unless they were detected after the
-    /// expulsion.
+    /// Removes the objects that no other vehicle has detected, unless they were detected more than
+    /// [`GRACE`] after the expulsion.
     pub(super) fn remove_objects(&mut self, objects: &mut Vec<FusedObject>, now: Timestamp) {
         self.0.retain(|_, at| now.since(*at) <= MEMORY);
         if self.0.is_empty() {
@@ -31,7 +35,11 @@ impl Expelled {
         }
         objects.retain(|object| {
             let age = Duration::from_secs_f64(object.age_s.unwrap_or(0.0).max(0.0));
-            let is_void = |vehicle| self.0.get(vehicle).is_some_and(|at| now - age <= *at);
+            let is_void = |vehicle| {
+                self.0
+                    .get(vehicle)
+                    .is_some_and(|at| now - age <= *at + GRACE)
+            };
             object.contributors.is_empty() || !object.contributors.iter().all(is_void)
         });
     }

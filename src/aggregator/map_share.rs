@@ -3,12 +3,12 @@
 
 use std::collections::BTreeMap;
 
-use crate::model::names::NodeName;
+use crate::model::names::{Label, NodeName};
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
 /// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
-/// parts: 1024 objects with short labels, as many as one report may have. Without this bound, one
-/// member's reports could make the map too large for the links to carry once per round.
+/// parts: about 950 objects with short labels, nearly as many as one report may have. Without this
+/// bound, one member's reports could make the map too large for the links to carry once per round.
 const MAX_SOLE_BYTES: usize = 1024 * (NUMBERS_BYTES + 32);
 
 /// Size in JSON of an object without its texts.
@@ -48,10 +48,14 @@ pub(super) fn limit_shares(objects: &mut Vec<FusedObject>) -> Vec<InvalidEntry> 
 
 /// About the size of an object in JSON.
 fn bytes_of(object: &FusedObject) -> usize {
-    let scores = object.scores.keys().map(|label| label.len() + SCORE_BYTES);
+    let escaped = |label: &Label| label.len() + label.matches(['"', '\\']).count();
+    let scores = object
+        .scores
+        .keys()
+        .map(|label| escaped(label) + SCORE_BYTES);
     let names = object.contributors.iter().chain(&object.vehicle);
     let names = names.map(|name| name.as_str().len());
-    NUMBERS_BYTES + object.label.len() + scores.sum::<usize>() + names.sum::<usize>()
+    NUMBERS_BYTES + escaped(&object.label) + scores.sum::<usize>() + names.sum::<usize>()
 }
 
 #[cfg(test)]

@@ -28,7 +28,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEvent, TimeUnit};
 use ecod::tracking::TracksLosses;
-use ecod::wire::{GlobalMap, InvalidEntry, ObjectReport, RejectReason, ReportKind};
+use ecod::wire::{FusedObject, GlobalMap, InvalidEntry, ObjectReport, RejectReason, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -401,12 +401,19 @@ impl FuserState {
         }
     }
 
+    /// Removes what only an expelled node has reported, as itself or as one of its parts.
     fn expel(&mut self, node: NodeName) {
+        let vehicle = node.vehicle();
         self.last_map = self
             .last_map
             .take()
             .filter(|(map, _)| map.aggregator != node);
-        self.command(Command::Expel { vehicle: node });
+        if let Some((map, _)) = &mut self.last_map {
+            let is_void =
+                |object: &FusedObject| object.contributors == std::slice::from_ref(&vehicle);
+            Arc::make_mut(map).objects.retain(|object| !is_void(object));
+        }
+        self.command(Command::Expel { vehicle });
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
