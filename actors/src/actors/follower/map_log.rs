@@ -19,7 +19,7 @@ const RETRY_PAUSE: Duration = Duration::from_secs(10);
 /// The disk therefore holds two of them at most.
 const MAX_BYTES: u64 = 512 * 1024 * 1024;
 
-/// Maximum length of half a line: the largest map.
+/// Maximum length of half a line that is removed: the largest map by default.
 const MAX_TORN_BYTES: u64 = 16 * 1024 * 1024;
 
 /// Beginning of each line of the log.

@@ -464,7 +464,8 @@ fn log(notice: Notice) {
                     fuser,
                     gateway,
                     reports,
-                    ..
+                    settings,
+                    load_percent: _,
                 },
         } => {
             tracing::warn!(
@@ -472,7 +473,8 @@ fn log(notice: Notice) {
                 fuser,
                 gateway,
                 reports,
-                "this node cannot lead: a part does not work"
+                settings,
+                "this node cannot lead: a part does not work, or its settings or certificate do not allow it"
             );
         }
         Notice::OutOfReach { members } => tracing::warn!(

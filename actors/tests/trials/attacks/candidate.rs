@@ -60,7 +60,7 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(beats(target, MAX_INTEGER)),
     },
     Row {
-        attack: "a member that vouches for the leader, which hangs",
+        attack: "unsigned vouches for the leader, which hangs",
         means: Means::Candidate,
         on_brokers: false,
         deeds: (30, "messages"),
@@ -147,11 +147,11 @@ async fn vouch(target: Target) -> anyhow::Result<()> {
     let insider = join(&target, Role::Auto).await?;
     let leader = Pid::from_raw(target.leader_process.try_into()?);
     kill(leader, Signal::SIGSTOP)?;
-    let answer = |(ask, term)| Body::LeaderEvidence {
+    let answer = |(ask, minutes)| Body::LeaderEvidence {
         ask,
         age_ms: 0,
         life: LifeSign {
-            led_ms: 600_000 * term,
+            led_ms: 600_000 * minutes,
             signature: None,
         },
     };
