@@ -143,9 +143,10 @@ impl TroubleKind {
         )
     }
 
-    /// True if hosts without the cell's key can cause it, from as many addresses as they like.
+    /// True if hosts can cause it under any name, or from as many addresses as they like: they have
+    /// proven neither the cell's key nor the name.
     fn is_of_strangers(self) -> bool {
-        matches!(self, Self::WrongKey | Self::OtherCell)
+        matches!(self, Self::WrongKey | Self::OtherCell | Self::NotAdmitted)
     }
 
     /// True if an aggregator with this trouble about a vehicle does not use the vehicle's reports.
@@ -186,7 +187,7 @@ const NEW_CAUSE_INTERVAL: Duration = Duration::from_secs(60);
 const TEXT_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Maximum number of stored troubles: about one vehicle with its parts or one host, of kinds that
-/// outside hosts can cause, and about all nodes other than this one.
+/// hosts can cause under any name, and about all nodes other than this one.
 const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
@@ -340,11 +341,15 @@ impl TroubleRegister {
             return true;
         }
         let vehicle = about.as_deref().map(vehicle_of);
-        let is_of_vehicle = |(other, _): &Key| other.as_deref().map(vehicle_of) == vehicle;
-        self.make_room_in(MAX_ABOUT_ONE, now, is_of_vehicle)
-            && (!kind.is_of_strangers()
-                || self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers()))
-            && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
+        let is_of_vehicle = |(other, kind): &Key| {
+            other.as_deref().map(vehicle_of) == vehicle && !kind.is_of_strangers()
+        };
+        let has_share = if kind.is_of_strangers() {
+            self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers())
+        } else {
+            self.make_room_in(MAX_ABOUT_ONE, now, is_of_vehicle)
+        };
+        has_share && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
     }
 
     /// The same check for one group of at most `most` entries.
@@ -563,6 +568,24 @@ mod tests {
                 .is_some()
         );
         assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 2);
+    }
+
+    #[test]
+    fn claimed_names_leave_a_vehicle_its_share() {
+        let mut register = TroubleRegister::default();
+        for part in 0..100 {
+            register.note(
+                TroubleKind::NotAdmitted,
+                Some(&format!("watson--{part}")),
+                "its certificate is of another name",
+                at(0),
+            );
+        }
+        assert!(
+            register
+                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .is_some()
+        );
     }
 
     #[test]
