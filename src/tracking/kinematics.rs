@@ -12,6 +12,9 @@ use nalgebra::{Matrix2, Vector2};
 use super::class::ObjectClass;
 use crate::model::time::Timestamp;
 
+/// Standard deviation of stated velocities, m/s.
+pub(super) const VELOCITY_SIGMA_MPS: f64 = 1.0;
+
 /// Measured position of an object in one frame, with its errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Measurement {

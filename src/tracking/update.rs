@@ -12,7 +12,7 @@ use super::config::TracksConfig;
 use super::existence::{ExistenceStatement, LookRates, LookState};
 use super::foreign::ForeignObjects;
 use super::handles::{SensorId, TrackIndex};
-use super::kinematics::{KinematicState, Measurement};
+use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
 use super::population::{Births, Population};
 use super::registration::{RegistrationFrame, RegistrationSample};
@@ -24,9 +24,6 @@ use super::trust::Judgement;
 use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
 use crate::wire::{ObjectReport, PerceivedObject};
-
-/// Standard deviation of reported velocities, m/s.
-pub(super) const VELOCITY_SIGMA_MPS: f64 = 1.0;
 
 /// Normalised innovation squared, of two dimensions, above which an object manoeuvres.
 const MANOEUVRE: f64 = 5.0;
