@@ -39,7 +39,7 @@ const ERROR_RATE: f64 = 1.6;
 /// Number of detections that confirm a track.
 pub(super) const CONFIRMED_HITS: u32 = 5;
 
-/// Maximum evidence of an object that one vehicle alone detects, nats, where others look and do not.
+/// Maximum evidence of the looks at an object that one vehicle alone detects, nats.
 const SOLE_NATS: f64 = 2.0;
 
 /// Time after which a detection says no more that its object is there.
@@ -214,12 +214,11 @@ impl Track {
             denied += trust * history.denied_nats(at);
             witnesses += usize::from(history.last_hit.is_some() && trust > 0.0);
         }
-        let nats = looks + confidences;
         // What deceives one vehicle deceives it again and again.
-        if witnesses < 2 && denied < 0.0 && self.vehicle.is_none() {
-            logistic(nats.min(SOLE_NATS) + denied)
+        if witnesses < 2 && self.vehicle.is_none() {
+            logistic(looks.min(SOLE_NATS) + confidences + denied)
         } else {
-            logistic(nats)
+            logistic(looks + confidences)
         }
     }
 
