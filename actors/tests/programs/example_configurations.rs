@@ -86,6 +86,7 @@ fn the_example_vehicles_fit_the_example_edge() {
 }
 
 /// Keys of a configuration that are no tables.
+#[cfg(feature = "camera")]
 fn leaves(table: &toml::Table, path: &str) -> Vec<String> {
     let below = |(key, value): (&String, &toml::Value)| match value {
         toml::Value::Table(inner) => leaves(inner, &format!("{path}{key}.")),
