@@ -124,7 +124,7 @@ impl Actor for Fuser {
         match message {
             FuserMessage::TakeReports => state.take_reports(),
             FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
-            FuserMessage::Expel { node } => state.expel(node),
+            FuserMessage::Expel { node } => state.expel(&node),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
@@ -402,12 +402,12 @@ impl FuserState {
     }
 
     /// Removes what only an expelled node has reported, as itself or as one of its parts.
-    fn expel(&mut self, node: NodeName) {
+    fn expel(&mut self, node: &NodeName) {
         let vehicle = node.vehicle();
         self.last_map = self
             .last_map
             .take()
-            .filter(|(map, _)| map.aggregator != node);
+            .filter(|(map, _)| map.aggregator != *node);
         if let Some((map, _)) = &mut self.last_map {
             let is_void =
                 |object: &FusedObject| object.contributors == std::slice::from_ref(&vehicle);

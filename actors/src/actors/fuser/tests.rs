@@ -112,9 +112,9 @@ async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more
         panic!("a map")
     };
     fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
-    fuser.expel(NodeName::from_static("gauss"));
+    fuser.expel(&NodeName::from_static("gauss"));
     assert!(fuser.last_map.is_some(), "another's");
-    fuser.expel(NodeName::from_static("edge"));
+    fuser.expel(&NodeName::from_static("edge"));
     assert!(fuser.last_map.is_none());
 }
 
