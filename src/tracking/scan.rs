@@ -42,7 +42,7 @@ pub(super) struct Scan<'a> {
     /// True if the vehicle has jumped to another place, so that its earlier samples are void.
     pub(super) has_jumped: bool,
     pub(super) detections: Vec<ScannedDetection<'a>>,
-    /// What the detections hide. It excuses misses; existences learn from the rates alone.
+    /// Directions that the detections hide. A hidden miss is no statement of the vehicle; existences use the rates alone.
     pub(super) occlusion: OcclusionMap,
 }
 
@@ -64,7 +64,8 @@ impl<'a> Scan<'a> {
             if own.is_some_and(|own| (own - reported).norm() < config.vehicle_radius_m) {
                 continue;
             }
-            if sensor.calibration.nats(log_odds) > 0.0 {
+            let confidence_nats = sensor.calibration.nats(log_odds);
+            if confidence_nats > 0.0 {
                 occlusion.add(object, config.vehicle_radius_m);
             }
             let class = ObjectClass::of(&object.label, config);
@@ -74,7 +75,7 @@ impl<'a> Scan<'a> {
                 object,
                 class,
                 log_odds,
-                confidence_nats: sensor.calibration.nats(log_odds),
+                confidence_nats,
                 reported,
                 measurement: Measurement {
                     position: correct(&reported),

@@ -2,7 +2,7 @@
 //!
 //! [`InstantUpdate::run`] updates the tracks of the reporting vehicles themselves, [associates](super::assignment) the
 //! detections of all vehicles with tracks, updates each track once with all its detections, weighs what every vehicle
-//! found where it looked, learns from it, and spawns tracks from what is left.
+//! found in its view, updates the sensor models, and spawns tracks from the remaining detections.
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -14,7 +14,7 @@ use super::foreign::ForeignObjects;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
-use super::population::{Births, Population};
+use super::population::Population;
 use super::registration::{RegistrationFrame, RegistrationSample};
 use super::scan::{Scan, ScannedDetection};
 use super::sensors::{Residual, SensorModel, Sensors};
@@ -280,7 +280,7 @@ impl InstantUpdate<'_> {
         }
     }
 
-    /// Updates a track once with all its detections, and learns the noise of the vehicles from the residuals.
+    /// Updates a track once with all its detections, and the noise of the vehicles by the residuals.
     fn update_track(&mut self, index: TrackIndex, hypothesis: &Hypothesis, scans: &[Scan<'_>]) {
         let at = self.at;
         let hits = || {
@@ -352,7 +352,7 @@ impl InstantUpdate<'_> {
         self.tracks.note_speed(index);
     }
 
-    /// Weighs all looks in the existences, then learns from them.
+    /// Weighs all looks in the existences, then updates rates, calibrations and judgements by them.
     fn weigh(&mut self, looks: &[Look], scans: &[Scan<'_>], evidence: &mut Vec<Evidence>) {
         let (at, leaving_hz) = (self.at, self.population.leaving_hz());
         let mut due = Vec::new();
@@ -403,7 +403,7 @@ impl InstantUpdate<'_> {
         }
     }
 
-    /// Learns rates and calibration from a look, by the existence after all looks of the instant.
+    /// Updates rates and calibration by a look and the existence after all looks of the instant.
     fn learn(&mut self, look: &Look, scan: &Scan<'_>) {
         let track = &mut self.tracks[look.track];
         if track.vehicle.is_some() {
@@ -461,7 +461,7 @@ impl InstantUpdate<'_> {
         });
     }
 
-    /// Takes note of what a vehicle sees where cells state that objects are, and judges those cells.
+    /// Compares a vehicle's detections with the objects that other cells state, and judges these cells.
     fn look_at_foreign(&mut self, scan: &Scan<'_>) {
         let (id, at, gate) = (scan.sensor, self.at, self.config.gate());
         let Some(sensor) = self.sensors.get(id).filter(|_| !self.foreign.is_empty()) else {
@@ -558,8 +558,8 @@ impl InstantUpdate<'_> {
         let mut track = self.begin(&measurement, first.report, detection.index, object);
         track.spawned_by = Some(first.sensor);
         let spawner = self.sensors.get(first.sensor);
-        let births = spawner.map_or_else(Births::default, |sensor| sensor.births.clone());
-        let mut log_odds = births.log_odds();
+        let births = spawner.map(|sensor| sensor.births.log_odds());
+        let mut log_odds = births.unwrap_or_default();
         for (number, (scan, detection)) in hits().enumerate() {
             let Some(sensor) = self.sensors.get(scan.sensor) else {
                 continue;
