@@ -143,8 +143,8 @@ impl TroubleKind {
         )
     }
 
-    /// True if hosts can cause it under any name, or from as many addresses as they like: they have
-    /// proven neither the cell's key nor the name.
+    /// True if a host can cause it under any name or from any address, without proof of the cell's
+    /// key or of the name.
     fn is_of_strangers(self) -> bool {
         matches!(self, Self::WrongKey | Self::OtherCell | Self::NotAdmitted)
     }

@@ -1,5 +1,5 @@
-//! Vehicles whose certificates were revoked or have expired. What they alone have reported leaves
-//! the map at once, although tracks outlive their last detection by seconds.
+//! Vehicles whose certificates were revoked or have expired. Objects that only these vehicles have
+//! reported leave the map at once, although tracks outlive their last detection by seconds.
 
 use std::collections::BTreeMap;
 use std::time::Duration;

@@ -43,7 +43,7 @@ const MAX_CLUSTER: usize = 48;
 /// Maximum age of a new track that may have any velocity.
 const FAST_WITHIN: Duration = Duration::from_millis(250);
 
-/// Maximum number of detections of a scan that are compared with such tracks. Where more are new, nothing is known yet,
+/// Maximum number of detections of a scan that are compared with such tracks. A scan with more is the first of the cell,
 /// or a vehicle fabricates them.
 const MAX_FAST: usize = 64;
 
@@ -163,7 +163,8 @@ impl<'a> Assignment<'a> {
         assignment.hypotheses
     }
 
-    /// Assigns one scan; `owners` are the hypotheses of its detections in the pass before, and afterwards those of this.
+    /// Assigns one scan. `owners` holds the hypothesis of each detection: before the call by the previous pass, after it by
+    /// this pass.
     fn assign(&mut self, scan: &Scan<'_>, owners: &mut Vec<usize>) {
         let information: Vec<Information> = scan
             .detections
@@ -196,7 +197,7 @@ impl<'a> Assignment<'a> {
         }
     }
 
-    /// Assigns remaining detections that are likely objects to tracks that are so new that they may have any velocity.
+    /// Assigns remaining detections that are likely objects to unconfirmed tracks, whose velocity is unknown.
     fn assign_fast(&mut self, scan: &Scan<'_>, assigned: &mut [Option<usize>]) {
         let taken: HashSet<usize> = assigned.iter().flatten().copied().collect();
         let mut pairs = Vec::new();

@@ -35,7 +35,7 @@ const MAX_PEER_NATS: f64 = 2.5;
 /// Minimum log-odds of a confirmed track at a new detection: it is found again, not born again.
 const LATENT_NATS: f64 = -3.0;
 
-/// Rate at which an object that no vehicle detects any more leaves, per second, in addition to that of all.
+/// Additional rate per second at which an object leaves that no vehicle detects.
 const UNSEEN_HZ: f64 = 0.15;
 
 /// Time between judgements of a vehicle's statement about an object.
@@ -44,7 +44,7 @@ pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 /// Minimum number of looks before a vehicle's statement is judged.
 const MIN_JUDGED_LOOKS: u32 = 5;
 
-/// What a vehicle's looks at an object found so far: the result of the last ones, and how many were alike.
+/// Results of a vehicle's looks at an object: the last result, and the number of equal results in a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum LookState {
     /// The vehicle has not looked yet.
@@ -61,7 +61,7 @@ pub(super) enum LookState {
 impl LookState {
     const COUNT: usize = 1 + 3 * Self::RUNS;
 
-    /// Lengths of runs that are told apart: 1, 2 to 3, and longer.
+    /// Number of classes of runs by length: 1, 2 to 3, and longer.
     const RUNS: usize = 3;
 
     /// The state after another look.
@@ -180,7 +180,7 @@ impl Existence {
         }
     }
 
-    /// Predicts to `at`: the object may have left at this rate per second, and at a greater one if nobody detects it.
+    /// Predicts to `at`: objects leave at this rate per second, and at a greater rate if no vehicle detects them.
     pub(super) fn predict(&mut self, at: Timestamp, leaving_hz: f64, is_detected: bool) {
         if at <= self.at {
             return;
@@ -202,7 +202,7 @@ impl Existence {
         self.log_odds = (self.log_odds + nats).clamp(-2.0 * MAX_NATS, MAX_NATS);
     }
 
-    /// A confirmed track is detected again: it is not less likely than one that was left for a while.
+    /// Sets the minimum for a confirmed track that is detected again after a while.
     pub(super) fn revive(&mut self) {
         self.log_odds = self.log_odds.max(LATENT_NATS);
     }
@@ -298,7 +298,7 @@ impl SensorHistory {
         self.is_view_stated = rates.is_view_stated;
     }
 
-    /// Counts a miss as a statement of the vehicle that nothing is there.
+    /// Counts a miss as a statement of the vehicle that the place is empty.
     pub(super) fn state_miss(&mut self) {
         self.unjudged.looks += 1;
     }
@@ -328,8 +328,8 @@ impl SensorHistory {
         self.kept(at) * self.sequence + self.confidence_nats(at)
     }
 
-    /// Its part in the evidence of all confidences, nats: that of a vehicle whose last look was a detection. Earlier
-    /// confidences do not say that the object is still there.
+    /// Evidence of the confidences that counts beside the other vehicles', nats: zero unless the last look was a detection,
+    /// because earlier confidences are no evidence that the object is still there.
     pub(super) fn shared_confidence_nats(&self, at: Timestamp) -> f64 {
         if self.state.is_hit() {
             CONFIDENCE_WEIGHT * self.confidence_nats(at)
@@ -338,7 +338,7 @@ impl SensorHistory {
         }
     }
 
-    /// Evidence against the object by a vehicle that looks at its place and has never detected it, nats.
+    /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
         if self.is_view_stated && self.last_hit.is_none() {
             self.kept(at) * self.sequence

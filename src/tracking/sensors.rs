@@ -1,4 +1,4 @@
-//! Owner of the sensor models: what is estimated of each vehicle. The only module that creates a [`SensorId`].
+//! Owner of the sensor models: the estimated properties of each vehicle. The only module that creates a [`SensorId`].
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -167,7 +167,7 @@ impl Sensors {
         }
     }
 
-    /// Sets the pose biases of all vehicles back to none.
+    /// Sets the pose biases of all vehicles to zero.
     pub(super) fn reset_pose_biases(&mut self, at: Timestamp, config: &TracksConfig) {
         for sensor in self.iter_mut() {
             sensor.pose_bias = PoseBias::new(at, &config.bias_prior());
@@ -412,7 +412,7 @@ impl NoiseModel {
         Matrix2::identity() * across + sight * sight.transpose() * (along - across) + floor
     }
 
-    /// Learns from the residual of a detection from a well-known track.
+    /// Updates the noise by the residual of a detection of a certain track.
     pub(super) fn learn(
         &mut self,
         object: &PerceivedObject,

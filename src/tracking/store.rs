@@ -35,7 +35,7 @@ pub(super) struct TrackStore {
 /// look-ups.
 const MIN_CELL_M: f64 = 24.0;
 
-/// A vehicle's unconfirmed tracks take at most one of so many shares of the room for tracks.
+/// Number of shares of the room for tracks. The unconfirmed tracks of one vehicle take at most one share.
 const SHARES: usize = 4;
 
 impl TrackStore {

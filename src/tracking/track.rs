@@ -42,7 +42,7 @@ pub(super) const CONFIRMED_HITS: u32 = 5;
 /// Maximum evidence of the looks at an object that one vehicle alone detects, nats.
 const SOLE_NATS: f64 = 2.0;
 
-/// Time after which a detection says no more that its object is there.
+/// Maximum age of a detection that is evidence of a present object.
 const DETECTED_WITHIN: Duration = Duration::from_secs(1);
 
 /// State of one track.
@@ -176,7 +176,7 @@ impl Track {
         common.max(MIN_LABEL_SIMILARITY)
     }
 
-    /// True if too few detections say how fast the object is.
+    /// True if there are too few detections for an estimate of the velocity.
     pub(super) fn may_have_any_velocity(&self) -> bool {
         !self.is_confirmed() && self.vehicle.is_none()
     }

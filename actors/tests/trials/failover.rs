@@ -119,7 +119,7 @@ async fn run_all() -> anyhow::Result<()> {
     }
 }
 
-/// One trial, told in one line.
+/// Runs one trial and prints its result in one line.
 async fn run(
     scenario: &Scenario,
     nodes: usize,

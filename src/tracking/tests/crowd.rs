@@ -12,7 +12,7 @@ fn place(person: usize, t_s: f64) -> Vector2<f64> {
     Vector2::new(along_m - 5.0, person as f64 - 6.0)
 }
 
-/// What came of the crowd.
+/// Map of the crowd over all rounds.
 struct Crowd {
     /// Objects with a confidence of at least 0.5, on average per round.
     published: f64,
@@ -21,7 +21,7 @@ struct Crowd {
 }
 
 /// Four cameras about the square at 2 Hz for a minute. A camera misses each person with a probability of `missed`, and reports
-/// a place where nobody is with a probability of 0.5 in each frame.
+/// an empty place with a probability of 0.5 in each frame.
 fn crowd(missed: f64) -> Crowd {
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let mut tracker = tracker();

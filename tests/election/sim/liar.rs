@@ -1,4 +1,4 @@
-//! A candidate that does not outrank the leader says whatever takes the lead.
+//! False election messages of a candidate that does not outrank the leader.
 
 use ecod::leadership::Rights;
 use ecod::leadership::election::{
@@ -13,7 +13,7 @@ use super::{SECOND, cell, check, ensure, for_seeds, one_best_leader, seeds, star
 use crate::sim::node::Fault;
 use crate::sim::world::{MS, World};
 
-/// Sequence numbers beyond those of the liar's own election, which nobody hears any more.
+/// First sequence number of the false messages. It is so large that all nodes drop the later genuine messages of the sender.
 const FORGED: u64 = 1 << 40;
 
 /// The lead stays where it is, and every honest node gets its rounds, while one in twenty packets is lost.
@@ -25,7 +25,7 @@ fn a_liar_takes_the_lead_from_nobody() {
         check(&mut world, seed, |world| {
             world.run_for(9 * SECOND);
             let leader = world.leaders()[0];
-            // A leader that nobody else follows makes way for its like.
+            // In a cell of two, a leader without followers yields to another node of its rank.
             let rank = |node: usize| {
                 (
                     world.nodes[node].config.role,
@@ -108,7 +108,7 @@ fn a_member_that_vouches_for_a_hung_leader_delays_no_takeover() {
                 // Questions have small numbers.
                 for _ in 0..100 {
                     seq += 1;
-                    tell(world, lie, (liar, leader), seq, &life);
+                    tell(world, lie, liar, leader, seq, &life);
                 }
                 world.run_for(20 * MS);
                 ensure(
@@ -121,7 +121,7 @@ fn a_member_that_vouches_for_a_hung_leader_delays_no_takeover() {
     });
 }
 
-/// What a false message is about.
+/// Names and state of the cell from which a false message is made.
 struct Scene {
     liar: NodeName,
     /// The present leadership, and its last sign of life.
@@ -144,7 +144,7 @@ struct Statement {
 struct Lie {
     message: &'static str,
     lie: &'static str,
-    /// True if the sender says that it leads.
+    /// True if the message claims the lead for its sender.
     claims: bool,
     state: fn(&Scene) -> Statement,
 }
@@ -428,7 +428,7 @@ fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
             let end = world.now + micros;
             while world.now < end {
                 seq += 1;
-                tell(world, lie, (liar, leader), seq, &life);
+                tell(world, lie, liar, leader, seq, &life);
                 world.run_for(10 * MS);
             }
         };
@@ -497,20 +497,20 @@ fn life_of(world: &World, leader: usize) -> LifeSign {
     }
 }
 
-/// Sends every honest node the same lie, one of all kinds.
+/// Sends a false message of a random kind to every honest node.
 fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
     let lie = loop {
         let lie = &LIES[world.random.index(LIES.len())];
-        // A leader that nobody follows makes way for one that does not hear it.
+        // In a cell of two, a leader without followers yields to a claimant that does not receive it.
         if world.nodes.len() > 2 || lie.lie != "leads, and does not receive the leader" {
             break lie;
         }
     };
-    tell(world, lie, (liar, leader), seq, &LifeSign::default());
+    tell(world, lie, liar, leader, seq, &LifeSign::default());
 }
 
-/// Sends every honest node a lie.
-fn tell(world: &mut World, lie: &Lie, (liar, leader): (usize, usize), seq: u64, life: &LifeSign) {
+/// Sends a false message of node `liar` about the leader to every honest node. `life` is the leader's sign of life in it.
+fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life: &LifeSign) {
     let Some(present) = world.nodes[leader]
         .election()
         .and_then(|election| election.epoch().cloned())

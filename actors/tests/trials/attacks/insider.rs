@@ -124,7 +124,7 @@ impl Insider {
         self.repeat_all(term, epoch, &[body]).await
     }
 
-    /// The same with several messages.
+    /// Repeats several messages as [`Self::repeat`] repeats one.
     pub(crate) async fn repeat_all(
         &self,
         term: u64,

@@ -156,7 +156,7 @@ async fn report_in_name(
     }
 }
 
-/// Reports an object that nobody else sees. Fails if a map has it later than [`GONE_WITHIN`] after the revocation.
+/// Reports an object that no other node sees. Fails if a map has it later than [`GONE_WITHIN`] after the revocation.
 async fn report_until_revoked(target: Target) -> anyhow::Result<()> {
     let credentials = Arc::clone(&target.vehicles[0]);
     let _member = Insider::join(&target, (VEHICLE, Role::Cav), Some(credentials)).await?;
