@@ -40,8 +40,8 @@ impl Seeking {
     }
 }
 
-/// The latest questions that this node asked for itself. Evidence is dated from the question that it answers, so stale evidence
-/// cannot circulate.
+/// The latest questions that this node asked for itself. Evidence is dated from the question that it
+/// answers, so stale evidence cannot circulate.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Questions {
     count: u64,
