@@ -35,6 +35,9 @@ const PRIOR_COMPARISONS: f64 = 10.0;
 /// Votes after which a vehicle has half of its final influence on the choice of the main group;
 /// bounds the gain of attackers who rejoin under new names.
 const TENURE_VOTES: f64 = 50.0;
+/// Support of a vehicle for itself; without it, the supports of two vehicles that agree against a
+/// third would be 0.
+const SELF_SUPPORT: f64 = 0.01;
 const GROUPING_STEPS: u32 = 30;
 const FACTOR_STEPS: u32 = 15;
 /// Comparisons after which the counts of stated labels are halved.
@@ -274,7 +277,7 @@ impl Dependence {
 fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     let mut belonging = influences.to_vec();
     for _ in 0..GROUPING_STEPS {
-        let mut support = vec![0.0; influences.len()];
+        let mut support: Vec<f64> = belonging.iter().map(|own| SELF_SUPPORT * own).collect();
         for (one, other, pair) in pairs {
             let affinity = (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.compared
                 / (pair.compared + PRIOR_COMPARISONS);

@@ -16,7 +16,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::{Landmark, Synonym};
 use ecod::reputation::{Evidence, ReputationLedger};
-use ecod::vote::{Vote, VoteConfig, VoteMode};
+use ecod::vote::{Vote, VoteConfig, VoteMode, WeightedConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, RejectReason, WirePose};
 use nalgebra::Point2;
 use proptest::prelude::*;
@@ -474,6 +474,49 @@ fn who_was_there_first_does_not_outvote_several_that_come_later() {
         let is_refuted =
             |(node, votes): (&NodeName, &i64)| (node.as_str() == "first") == (*votes > 0);
         assert!(refuted.iter().all(is_refuted), "{rare} rare: {refuted:?}");
+    }
+}
+
+/// Two vehicles that are always right agree as closely as copies do.
+#[test]
+fn two_that_are_always_right_outvote_a_third_that_is_mostly_wrong() {
+    let weighted = WeightedConfig {
+        freshness_s: 1e9,
+        ..WeightedConfig::default()
+    };
+    let config = VoteConfig {
+        weighted,
+        ..VoteConfig::default()
+    };
+    let mut vote = Vote::new(config, Vec::new());
+    for item in 0..120u64 {
+        let at = START + Duration::from_millis(100 * item);
+        let [right, wrong] = if item % 2 == 0 {
+            ["cup", "mouse"]
+        } else {
+            ["mouse", "cup"]
+        };
+        let third = if item % 5 == 0 { right } else { wrong };
+        for (node, label) in [("a", right), ("b", right), ("c", third)] {
+            let name = format!("item-{item}");
+            let report = report(node, item, at, &[(&name, label, 0.8)]);
+            vote.observe(&report, at).unwrap();
+        }
+        vote.close(at);
+    }
+    for verdict in vote.verdicts() {
+        let item: u64 = verdict.landmark["item-".len()..].parse().unwrap();
+        let right = if item.is_multiple_of(2) {
+            "cup"
+        } else {
+            "mouse"
+        };
+        assert_eq!(
+            verdict.label.as_deref(),
+            Some(right),
+            "{}",
+            verdict.landmark
+        );
     }
 }
 
