@@ -5,6 +5,7 @@ mod columns;
 mod convert;
 mod demo;
 mod eval;
+mod eval_labels;
 mod files;
 mod report;
 mod street;
@@ -49,6 +50,9 @@ enum Command {
     Convert(convert::ConvertArguments),
     /// Evaluate the output of a replay against the truth
     Eval(eval::EvalArguments),
+    /// Evaluate VOTE and the majority on a label set: a table of many voters' answers about many
+    /// items
+    EvalLabels(eval_labels::EvalLabelsArguments),
 }
 
 /// Runs the program with the process's arguments.
@@ -63,6 +67,7 @@ pub fn main() -> ExitCode {
         Command::Report(arguments) => report::run(&arguments),
         Command::Convert(arguments) => convert::run(&arguments),
         Command::Eval(arguments) => eval::run(&arguments),
+        Command::EvalLabels(arguments) => eval_labels::run(&arguments),
     };
     exit("ecod-lab", outcome)
 }

@@ -11,6 +11,7 @@
 
 pub mod baselines;
 pub mod formats;
+pub mod label_set;
 pub mod tracks;
 mod truth;
 mod votes;

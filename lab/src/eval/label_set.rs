@@ -1,0 +1,521 @@
+//! Label sets: answers of many voters about many items, judged by VOTE and by the majority.
+//!
+//! Each item is a landmark and each voter a vehicle. Votes never go stale, and a voter's last answer
+//! about an item replaces earlier ones.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::vote::{MAX_LABELS, Vote, VoteConfig, WeightedConfig};
+use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+
+const START: Timestamp = Timestamp(1_700_000_000_000_000);
+const ROUND: Duration = Duration::from_millis(100);
+/// Bins of a reliability diagram.
+const BINS: usize = 10;
+
+/// One answer.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Answer {
+    /// Index of the voter.
+    pub voter: usize,
+    /// Index of the label.
+    pub label: usize,
+    /// Stated confidence, 0 to 1.
+    pub confidence: f64,
+}
+
+/// The answers about one item.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelledItem {
+    /// Name in the file.
+    pub name: String,
+    /// At most one answer of each voter.
+    pub answers: Vec<Answer>,
+    /// Index of the true label, if it is known.
+    pub truth: Option<usize>,
+}
+
+/// A label set that cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum LabelSetError {
+    /// The table cannot be read.
+    #[error("{0}")]
+    Table(String),
+    /// A required column is missing.
+    #[error(
+        "there is no column {0}; the columns are item, voter, label and perhaps confidence and truth"
+    )]
+    NoColumn(&'static str),
+    /// A confidence is no number from 0 to 1.
+    #[error("line {line}: confidence {text:?} is no number from 0 to 1")]
+    Confidence {
+        /// Line of the file, from 1.
+        line: u64,
+        /// The cell.
+        text: String,
+    },
+    /// A required cell is empty.
+    #[error("line {line}: {column} is empty")]
+    Empty {
+        /// Line of the file, from 1.
+        line: u64,
+        /// The column.
+        column: &'static str,
+    },
+    /// Two truths of one item differ.
+    #[error("line {line}: item {item:?} has another truth before")]
+    TwoTruths {
+        /// Line of the file, from 1.
+        line: u64,
+        /// The item.
+        item: String,
+    },
+    /// There are more labels than VOTE takes.
+    #[error("there are {0} labels; at most {MAX_LABELS} are possible")]
+    TooManyLabels(usize),
+    /// The file has no answers.
+    #[error("there is no answer")]
+    NoAnswer,
+}
+
+/// Answers of many voters about many items.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LabelSet {
+    /// In the order of the file.
+    pub items: Vec<LabelledItem>,
+    /// Names of the labels in alphabetical order.
+    pub labels: Vec<String>,
+    /// Names of the voters in the order of the file.
+    pub voters: Vec<String>,
+    /// Answers that a later answer of the same voter about the same item replaced.
+    pub replaced: usize,
+}
+
+/// The verdict about one item.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Decision {
+    /// Index of the label.
+    pub label: usize,
+    /// Probability of the label according to the method.
+    pub probability: f64,
+}
+
+/// How right the decisions of a method are.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Judgement {
+    /// Share of right decisions in percent of the items with a known truth.
+    pub accuracy_pct: f64,
+    /// Expected calibration error in percent: |mean probability − share of right decisions|, in ten
+    /// bins of probability.
+    pub calibration_error_pct: f64,
+    /// Decisions, mean probability and share of right decisions in each bin that has any.
+    pub reliability: Vec<(usize, f64, f64)>,
+}
+
+fn position(names: &mut HashMap<String, usize>, name: &str) -> usize {
+    let next = names.len();
+    *names.entry(name.to_owned()).or_insert(next)
+}
+
+impl LabelSet {
+    /// Reads a table with the columns `item`, `voter` (or `worker`) and `label`, and perhaps
+    /// `confidence` and `truth`. Commas, semicolons and tabs separate columns, quotes enclose cells
+    /// (RFC 4180). A truth may be on any line of its item. `truths` is the text of a second table
+    /// with the columns `item` and `truth`.
+    ///
+    /// # Errors
+    /// Returns a [`LabelSetError`] that names the first line or column that is wrong.
+    pub fn parse(text: &str, truths: Option<&str>) -> Result<Self, LabelSetError> {
+        let mut reading = Reading::default();
+        reading.read_answers(text)?;
+        if let Some(truths) = truths {
+            reading.read_truths(truths)?;
+        }
+        reading.finish()
+    }
+
+    /// Items with a known truth.
+    pub fn judged_items(&self) -> usize {
+        self.items
+            .iter()
+            .filter(|item| item.truth.is_some())
+            .count()
+    }
+
+    /// Number of answers.
+    pub fn answers(&self) -> usize {
+        self.items.iter().map(|item| item.answers.len()).sum()
+    }
+
+    /// Expected accuracy in percent of the most frequent label, of which one is drawn on a tie.
+    pub fn majority_accuracy_pct(&self) -> f64 {
+        let chance = |item: &LabelledItem| {
+            let mut votes: BTreeMap<usize, usize> = BTreeMap::new();
+            for answer in &item.answers {
+                *votes.entry(answer.label).or_default() += 1;
+            }
+            let most = votes.values().max().copied()?;
+            let first = votes.values().filter(|count| **count == most).count();
+            let is_right = votes.get(&item.truth?) == Some(&most);
+            Some(if is_right { 1.0 / first as f64 } else { 0.0 })
+        };
+        let right: f64 = self.items.iter().filter_map(chance).sum();
+        100.0 * right / self.judged_items().max(1) as f64
+    }
+
+    /// Decisions of VOTE about all items: `online` item after item in the random order of `seed`,
+    /// and after `passes` over all answers.
+    pub fn vote(&self, config: &WeightedConfig, seed: u64, passes: u32) -> [Vec<Decision>; 2] {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut order: Vec<usize> = (0..self.items.len()).collect();
+        order.shuffle(&mut rng);
+        let mut vote = Vote::new(self.vote_config(config), Vec::new());
+        let mut sequence = vec![0; self.voters.len()];
+        let mut online = vec![
+            Decision {
+                label: 0,
+                probability: 0.0
+            };
+            self.items.len()
+        ];
+        for (round, item) in (0..).zip(order) {
+            let now = START + ROUND * round;
+            let mut answers = self.items[item].answers.clone();
+            answers.shuffle(&mut rng);
+            for answer in answers {
+                sequence[answer.voter] += 1;
+                let report = report(item, answer, sequence[answer.voter], now);
+                // The names and numbers are valid, and there is room for all of them.
+                let observed = vote.observe(&report, now);
+                debug_assert_eq!(observed, Ok(()));
+            }
+            take(&vote.close(now).verdicts, &mut online);
+        }
+        let mut refined = online.clone();
+        take(&vote.refine(passes), &mut refined);
+        [online, refined]
+    }
+
+    fn vote_config(&self, weighted: &WeightedConfig) -> VoteConfig {
+        VoteConfig {
+            max_landmarks: self.items.len().max(1),
+            max_vehicles: self.voters.len().max(1),
+            max_labels: self.labels.len().max(1),
+            weighted: WeightedConfig {
+                freshness_s: 1e9,
+                smoothing_share: 0.0,
+                hysteresis: 0.0,
+                ..weighted.clone()
+            },
+            ..VoteConfig::default()
+        }
+    }
+
+    /// Compares decisions with the known truths.
+    pub fn judge(&self, decisions: &[Decision]) -> Judgement {
+        let mut bins = [(0, 0.0, 0.0); BINS];
+        for (item, decision) in self.items.iter().zip(decisions) {
+            let Some(truth) = item.truth else { continue };
+            let bin = ((decision.probability * BINS as f64) as usize).min(BINS - 1);
+            let (count, probability, right) = &mut bins[bin];
+            *count += 1;
+            *probability += decision.probability;
+            *right += f64::from(u8::from(decision.label == truth));
+        }
+        let judged = self.judged_items().max(1) as f64;
+        let right: f64 = bins.iter().map(|(.., right)| right).sum();
+        let error: f64 = bins
+            .iter()
+            .map(|(_, probability, right)| (probability - right).abs())
+            .sum();
+        let means = |&(count, probability, right): &(usize, f64, f64)| {
+            let all = count as f64;
+            (count, probability / all, right / all)
+        };
+        Judgement {
+            accuracy_pct: 100.0 * right / judged,
+            calibration_error_pct: 100.0 * error / judged,
+            reliability: bins
+                .iter()
+                .filter(|(count, ..)| *count > 0)
+                .map(means)
+                .collect(),
+        }
+    }
+}
+
+/// A report of one answer. Names are numbers, so that any text in a file is a valid name.
+fn report(item: usize, answer: Answer, seq: u64, at: Timestamp) -> ObjectReport {
+    let label = format!("{:05}", answer.label);
+    let object = PerceivedObject {
+        landmark: Some(format!("{item}").as_str().into()),
+        ..PerceivedObject::new(label.as_str(), answer.confidence, 0.0, 0.0)
+    };
+    let name = NodeName::new(format!("voter-{}", answer.voter)).expect("letters and digits");
+    ObjectReport {
+        objects: vec![object],
+        ..ObjectReport::new(name, seq, at)
+    }
+}
+
+/// Stores verdicts as decisions, by the numbers in the names of [`report`].
+fn take(verdicts: &[Verdict], decisions: &mut [Decision]) {
+    for verdict in verdicts {
+        let item = verdict.landmark.as_str().parse::<usize>();
+        let label = verdict.label.as_deref().map(str::parse::<usize>);
+        if let (Ok(item), Some(Ok(label))) = (item, label) {
+            let all: f64 = verdict.votes.values().sum();
+            decisions[item] = Decision {
+                label,
+                probability: verdict.score / all.max(f64::MIN_POSITIVE),
+            };
+        }
+    }
+}
+
+/// A label set while it is read: names have numbers in the order of the file.
+#[derive(Default)]
+struct Reading {
+    items: HashMap<String, usize>,
+    voters: HashMap<String, usize>,
+    labels: HashMap<String, usize>,
+    answers: Vec<BTreeMap<usize, Answer>>,
+    truths: HashMap<usize, usize>,
+    replaced: usize,
+}
+
+impl Reading {
+    fn read_answers(&mut self, text: &str) -> Result<(), LabelSetError> {
+        let table = Table::new(text)?;
+        let item_column = table.column("item")?;
+        let voter_column = table
+            .column("voter")
+            .or_else(|error| table.column("worker").map_err(|_| error))?;
+        let label_column = table.column("label")?;
+        let confidence_column = table.column("confidence").ok();
+        let truth_column = table.column("truth").ok();
+        for (line, row) in &table.rows {
+            let line = *line;
+            let cell = |column: usize, name: &'static str| match row.get(column) {
+                Some(text) if !text.is_empty() => Ok(text),
+                _ => Err(LabelSetError::Empty { line, column: name }),
+            };
+            let item_name = cell(item_column, "item")?;
+            let item = position(&mut self.items, item_name);
+            let voter = position(&mut self.voters, cell(voter_column, "voter")?);
+            let label = position(&mut self.labels, cell(label_column, "label")?);
+            let stated = confidence_column.and_then(|column| row.get(column));
+            let confidence = match stated {
+                None | Some("") => 1.0,
+                Some(text) => text
+                    .parse()
+                    .ok()
+                    .filter(|confidence| (0.0..=1.0).contains(confidence))
+                    .ok_or_else(|| LabelSetError::Confidence {
+                        line,
+                        text: text.to_owned(),
+                    })?,
+            };
+            self.answers.resize_with(self.items.len(), BTreeMap::new);
+            let answer = Answer {
+                voter,
+                label,
+                confidence,
+            };
+            if self.answers[item].insert(voter, answer).is_some() {
+                self.replaced += 1;
+            }
+            let truth = truth_column.and_then(|column| row.get(column));
+            if let Some(truth) = truth.filter(|truth| !truth.is_empty()) {
+                self.add_truth(line, item, item_name, truth)?;
+            }
+        }
+        if table.rows.is_empty() {
+            return Err(LabelSetError::NoAnswer);
+        }
+        Ok(())
+    }
+
+    /// Truths of items without answers are left out.
+    fn read_truths(&mut self, text: &str) -> Result<(), LabelSetError> {
+        let table = Table::new(text)?;
+        let (item_column, truth_column) = (table.column("item")?, table.column("truth")?);
+        for (line, row) in &table.rows {
+            let name = row.get(item_column).unwrap_or_default();
+            let truth = row.get(truth_column).unwrap_or_default();
+            if let Some(&item) = self.items.get(name)
+                && !truth.is_empty()
+            {
+                self.add_truth(*line, item, name, truth)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn add_truth(
+        &mut self,
+        line: u64,
+        item: usize,
+        name: &str,
+        truth: &str,
+    ) -> Result<(), LabelSetError> {
+        let label = position(&mut self.labels, truth);
+        match self.truths.insert(item, label) {
+            Some(before) if before != label => Err(LabelSetError::TwoTruths {
+                line,
+                item: name.to_owned(),
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    /// Numbers labels in alphabetical order, which decides ties.
+    fn finish(self) -> Result<LabelSet, LabelSetError> {
+        if self.labels.len() > MAX_LABELS {
+            return Err(LabelSetError::TooManyLabels(self.labels.len()));
+        }
+        let sorted: BTreeSet<&String> = self.labels.keys().collect();
+        let mut number = vec![0; self.labels.len()];
+        for (place, name) in sorted.iter().enumerate() {
+            number[self.labels[*name]] = place;
+        }
+        let labels = sorted.into_iter().cloned().collect();
+        let item = |(name, index): (&str, usize)| LabelledItem {
+            name: name.to_owned(),
+            answers: self.answers[index]
+                .values()
+                .map(|answer| Answer {
+                    label: number[answer.label],
+                    ..*answer
+                })
+                .collect(),
+            truth: self.truths.get(&index).map(|label| number[*label]),
+        };
+        Ok(LabelSet {
+            items: in_order(&self.items).map(item).collect(),
+            labels,
+            voters: in_order(&self.voters)
+                .map(|(name, _)| name.to_owned())
+                .collect(),
+            replaced: self.replaced,
+        })
+    }
+}
+
+/// Names with their numbers, in the order of the numbers.
+fn in_order(names: &HashMap<String, usize>) -> impl Iterator<Item = (&str, usize)> {
+    let mut sorted: Vec<(&str, usize)> = names
+        .iter()
+        .map(|(name, number)| (name.as_str(), *number))
+        .collect();
+    sorted.sort_unstable_by_key(|(_, number)| *number);
+    sorted.into_iter()
+}
+
+/// The rows of a table with a header.
+struct Table {
+    header: Vec<String>,
+    /// With the line in the file, from 1.
+    rows: Vec<(u64, csv::StringRecord)>,
+}
+
+impl Table {
+    /// The separator is the most frequent of comma, semicolon and tab in the first line.
+    fn new(text: &str) -> Result<Self, LabelSetError> {
+        let text = text.trim_start_matches('\u{feff}');
+        let first = text.lines().next().unwrap_or_default();
+        let count = |separator: u8| first.bytes().filter(|byte| *byte == separator).count();
+        let separator = [b'\t', b';', b','].into_iter().max_by_key(|s| count(*s));
+        let mut reader = csv::ReaderBuilder::new()
+            .delimiter(separator.unwrap_or(b','))
+            .trim(csv::Trim::All)
+            .flexible(true)
+            .from_reader(text.as_bytes());
+        let unreadable = |error: csv::Error| LabelSetError::Table(error.to_string());
+        let header = reader.headers().map_err(unreadable)?;
+        let header = header.iter().map(str::to_lowercase).collect();
+        let mut rows = Vec::new();
+        for row in reader.records() {
+            let row = row.map_err(unreadable)?;
+            rows.push((row.position().map_or(0, csv::Position::line), row));
+        }
+        Ok(Self { header, rows })
+    }
+
+    fn column(&self, name: &'static str) -> Result<usize, LabelSetError> {
+        let place = self.header.iter().position(|column| column == name);
+        place.ok_or(LabelSetError::NoColumn(name))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PLAIN: &str = "item,voter,label,truth\nx,a,cup,cup\nx,b,mouse,\ny,a,cup,mouse\n";
+
+    #[test]
+    fn tables_of_any_form_are_the_same_set() {
+        let plain = LabelSet::parse(PLAIN, None).unwrap();
+        assert_eq!(plain.labels, ["cup", "mouse"]);
+        assert_eq!((plain.items.len(), plain.judged_items()), (2, 2));
+        let semicolons = format!("\u{feff}{}", PLAIN.replace(',', ";").replace('\n', "\r\n"));
+        assert_eq!(LabelSet::parse(&semicolons, None).unwrap(), plain);
+        let quoted = PLAIN.replace("cup", "\"cup\"").replace("voter", "Worker");
+        assert_eq!(LabelSet::parse(&quoted, None).unwrap(), plain);
+        let answers = "item,voter,label\nx,a,cup\nx,b,mouse\ny,a,cup\n";
+        let truths = "item,truth\nx,cup\ny,mouse\nz,cup\n";
+        assert_eq!(LabelSet::parse(answers, Some(truths)).unwrap(), plain);
+    }
+
+    #[test]
+    fn a_later_answer_replaces_the_earlier_one() {
+        let set = LabelSet::parse("item,voter,label\nx,a,cup\nx,a,mouse\n", None).unwrap();
+        assert_eq!(set.replaced, 1);
+        let label = set.items[0].answers[0].label;
+        assert_eq!((set.answers(), set.labels[label].as_str()), (1, "mouse"));
+    }
+
+    #[test]
+    fn errors_name_line_and_column() {
+        let error = |text: &str| LabelSet::parse(text, None).unwrap_err().to_string();
+        assert!(error("item,label\nx,cup\n").contains("column voter"));
+        assert_eq!(
+            error("item,voter,label\nx,,cup\n"),
+            "line 2: voter is empty"
+        );
+        assert_eq!(
+            error("item,voter,label,confidence\nx,a,cup,1\nx,b,cup,2\n"),
+            "line 3: confidence \"2\" is no number from 0 to 1"
+        );
+        assert_eq!(
+            error("item,voter,label,truth\nx,a,cup,cup\nx,b,cup,mouse\n"),
+            "line 3: item \"x\" has another truth before"
+        );
+        assert_eq!(error("item,voter,label\n"), "there is no answer");
+    }
+
+    #[test]
+    fn vote_finds_the_voter_who_is_mostly_wrong() {
+        let mut text = "item,voter,label,truth\n".to_owned();
+        for item in 0..60 {
+            let truth = ["cup", "mouse"][item % 2];
+            let wrong = ["mouse", "cup"][item % 2];
+            text += &format!("{item},a,{truth},{truth}\n{item},b,{truth},\n");
+            let third = if item % 5 == 0 { truth } else { wrong };
+            text += &format!("{item},c,{third},\n");
+        }
+        let set = LabelSet::parse(&text, None).unwrap();
+        assert_eq!(set.majority_accuracy_pct(), 100.0);
+        let [online, refined] = set.vote(&WeightedConfig::default(), 1, 10);
+        for decisions in [online, refined] {
+            assert_eq!(set.judge(&decisions).accuracy_pct, 100.0);
+        }
+    }
+}
