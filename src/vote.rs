@@ -20,6 +20,7 @@ mod configured_method;
 mod confusion;
 mod dawid_skene;
 mod dependence;
+mod label_bias;
 mod label_table;
 mod landmark_votes;
 mod likelihood;

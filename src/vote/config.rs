@@ -109,20 +109,16 @@ config_section! {
         /// label, but notices a new object later. With 0 only the last statement counts, for inputs
         /// in which a new statement corrects the earlier one.
         pub smoothing_share: f64 = 0.5, in 0.0 to 10.0;
-        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion
-        /// against the vehicle's own record of one class; default 5. A lower value adapts to
-        /// classes faster, but also to noise.
+        /// Weight, in votes, of a vehicle's accuracy on all classes against its own record of one
+        /// class; default 5. A lower value adapts to classes faster, but also to noise.
         pub class_prior_votes: f64 = 5.0, in 1e-3 to 1e6;
         /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
         pub vehicle_prior_votes: f64 = 8.0, in 1e-3 to 1e6;
         /// Assumed rate of right votes of a vehicle without evidence, 0.5 to 1; default 0.7.
         pub assumed_accuracy: f64 = 0.7, in 0.5 to 0.999;
-        /// Share of the fleet's confusion in the assumed distribution of errors; the rest is spread
-        /// evenly over all wrong labels. Default 0.5.
-        pub confusion_sharing: f64 = 0.5, in 0.0 to 1.0;
-        /// Maximum weight of the shares of the classes, in verdicts; default 100. A higher value
+        /// Maximum weight of the shares of the classes, in verdicts; default 50. A higher value
         /// favours frequent labels.
-        pub class_share_verdicts: f64 = 100.0, in 2.0 to 1e9;
+        pub class_share_verdicts: f64 = 50.0, in 2.0 to 1e9;
         /// Votes over which the memory of a vehicle fades to 1/e; default 500. A lower value
         /// notices a change of behaviour sooner.
         pub memory_votes: f64 = 500.0, in 1.0 to 1e9;

@@ -1,6 +1,8 @@
 //! Confusion counts: how often each label was stated where each was true.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
+
+use hashbrown::HashMap;
 
 /// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
@@ -12,8 +14,8 @@ const MIN_SCALE: f64 = 1e-60;
 /// All counts share one scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
-    cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
-    rows: BTreeMap<LabelIndex, f64>,
+    cells: HashMap<(LabelIndex, LabelIndex), f64>,
+    rows: HashMap<LabelIndex, f64>,
     correct: f64,
     total: f64,
     scale: f64,
@@ -22,8 +24,8 @@ pub(super) struct Confusion {
 impl Default for Confusion {
     fn default() -> Self {
         Self {
-            cells: BTreeMap::new(),
-            rows: BTreeMap::new(),
+            cells: HashMap::new(),
+            rows: HashMap::new(),
             correct: 0.0,
             total: 0.0,
             scale: 1.0,
@@ -51,12 +53,14 @@ impl Confusion {
         let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
             labels.contains(&truth) || labels.contains(&stated)
         };
-        let gone: Vec<_> = self
+        let mut gone: Vec<_> = self
             .cells
             .iter()
             .filter(|(cell, _)| is_about(cell))
             .map(|(cell, n)| (*cell, *n))
             .collect();
+        // The order of a hash map differs between processes, and with it the rounding of sums.
+        gone.sort_by_key(|(cell, _)| *cell);
         for ((truth, stated), count) in gone {
             self.add_scaled(truth, stated, -count);
             self.cells.remove(&(truth, stated));
@@ -90,11 +94,11 @@ impl Confusion {
             .map_or(0.0, |r| self.scale * r.max(0.0))
     }
 
-    /// True labels with their numbers of votes.
-    pub(super) fn rows(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
+    /// Labels with the number of votes for them where they were true.
+    pub(super) fn diagonal(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
         self.rows
-            .iter()
-            .map(|(&truth, &count)| (truth, self.scale * count.max(0.0)))
+            .keys()
+            .map(|&truth| (truth, self.cell(truth, truth)))
     }
 
     /// Number of right votes.

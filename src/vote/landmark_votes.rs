@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::confusion::LabelIndex;
 use super::dependence::Dependence;
+use super::label_bias::LabelBias;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
 
@@ -133,11 +134,12 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Counts new votes as evidence on dependence and on confidences; where there are many voters,
+    /// Counts new votes as evidence on dependence, label bias and confidences; where there are many voters,
     /// `order` decides which pairs are compared.
     pub(super) fn compare(
         &mut self,
         dependence: &mut Dependence,
+        label_bias: &mut LabelBias,
         calibration: &mut ConfidenceCalibration,
         order: impl Fn(usize) -> usize,
     ) {
@@ -149,6 +151,7 @@ impl LandmarkVotes {
                 .collect();
             votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
             dependence.compare(&votes);
+            label_bias.compare(&votes);
             for vote in self.votes.iter_mut().filter(|c| !c.compared) {
                 calibration.record_confidence(vote.vehicle, vote.confidence);
                 vote.compared = true;

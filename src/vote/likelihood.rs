@@ -23,17 +23,14 @@ pub(super) struct LandmarkPosterior {
     pub(super) labels: Posterior,
     /// Probability of each vote's label given the other votes.
     pub(super) agreements: Vec<f64>,
-    /// Log of the probability of the votes, each predicted from the others, in nats.
-    pub(super) log_probability: f64,
 }
 
 /// Likelihood of one vote, by candidate for the true label.
 pub(super) struct Likelihood {
-    /// Probability that the vehicle states the vote's label.
-    pub(super) stating: Vec<f64>,
-    /// Its logarithm, but at most its value where the stated label is true, so that a vote does not
-    /// count against its own label. Otherwise the model has a mirrored solution, in which the
-    /// honest majority counts as consistently wrong.
+    /// Logarithm of the probability that the vehicle states the vote's label, but at most its value
+    /// where the stated label is true, so that a vote does not count against its own label.
+    /// Otherwise the model has a mirrored solution, in which the honest majority counts as
+    /// consistently wrong.
     pub(super) logs: Vec<f64>,
     /// The logarithm where the stated label is true.
     own_log: f64,
@@ -41,17 +38,19 @@ pub(super) struct Likelihood {
 
 impl Likelihood {
     /// Created from the probabilities by candidate; the vote's label is one of the candidates.
-    pub(super) fn new(vote: &WeightedVote, candidates: &[LabelIndex], stating: Vec<f64>) -> Self {
-        let own = candidates
+    pub(super) fn new(
+        vote: &WeightedVote,
+        candidates: &[LabelIndex],
+        stating: impl Iterator<Item = f64>,
+    ) -> Self {
+        let mut logs: Vec<f64> = stating.map(|p| p.max(1e-12).ln()).collect();
+        let own_log = candidates
             .iter()
-            .zip(&stating)
+            .zip(&logs)
             .find(|(label, _)| **label == vote.label)
-            .map_or(1.0, |(_, own)| *own);
-        Self {
-            logs: stating.iter().map(|p| p.min(own).ln()).collect(),
-            own_log: own.ln(),
-            stating,
-        }
+            .map_or(0.0, |(_, own)| *own);
+        logs.iter_mut().for_each(|log| *log = log.min(own_log));
+        Self { logs, own_log }
     }
 
     /// The posterior of the same candidates without `vote`.

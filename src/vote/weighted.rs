@@ -30,8 +30,6 @@ use crate::wire::{ForeignVotes, Reputation, Verdict};
 const MIN_WEIGHT: f64 = 0.01;
 /// Share of dependent vehicles among the present ones from which they may have decided verdicts.
 const MANY_DEPENDENT: f64 = 0.2;
-/// Number of times that all landmarks are evaluated in turn when learning starts again.
-const START_SWEEPS: u32 = 3;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
 #[derive(Debug, Clone, Default)]
@@ -107,11 +105,13 @@ impl WeightedVoting {
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
             return;
         };
-        landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| {
-            vehicle
-        });
+        landmark_votes.compare(
+            &mut self.dependence,
+            &mut self.model.label_bias,
+            &mut self.calibration,
+            |vehicle| vehicle,
+        );
         landmark_votes.weigh(&self.dependence, &self.calibration, weights);
-        let is_new = landmark_votes.votes.iter().any(|vote| !vote.judged);
         landmark_votes
             .votes
             .iter_mut()
@@ -119,11 +119,7 @@ impl WeightedVoting {
         let votes = landmark_votes.weighted_votes();
         self.model.refresh(votes.iter().map(|vote| vote.vehicle));
         let candidates = landmark_votes.candidates();
-        let judged = if is_new {
-            self.model.judge_new(&votes, &candidates)
-        } else {
-            self.model.judge(&votes, &candidates)
-        };
+        let judged = self.model.judge(&votes, &candidates);
         landmark_votes.take(judged, &mut self.calibration);
         self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         landmark_votes.counted = true;
@@ -152,13 +148,13 @@ impl WeightedVoting {
         };
         if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
             self.model.clear_settled();
-            self.start_from_majorities();
+            self.start_again();
         } else if groups.dependent as f64
             >= MANY_DEPENDENT * present.iter().filter(|present| **present).count() as f64
             && groups.dependent > 2 * self.known_dependent
         {
             self.known_dependent = groups.dependent;
-            self.start_again(START_SWEEPS);
+            self.start_again();
         }
     }
 

@@ -23,6 +23,7 @@ impl WeightedVoting {
         }
         self.dependence.forget(&gone);
         self.calibration.forget(&gone);
+        self.model.label_bias.forget(&gone);
         self.labels.forget_vehicles(&gone);
         for &vehicle in &gone {
             self.counts[vehicle] = Counts::default();

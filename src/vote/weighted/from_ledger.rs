@@ -43,14 +43,16 @@ impl WeightedVoting {
             .vehicles
             .iter_mut()
             .for_each(|vehicle| vehicle.inherited = Confusion::default());
-        self.model
-            .inherit_coupling(known.iter().map(|(_, labels)| labels));
+        self.model.label_bias.clear_inherited();
         for (node, labels) in known {
             let mut inherited = Confusion::default();
-            for (label, (correct, incorrect)) in labels {
-                let Some(label) = self.labels.index(&label) else {
-                    continue;
-                };
+            let labels: Vec<(LabelIndex, f64, f64)> = labels
+                .into_iter()
+                .filter_map(|(label, (correct, incorrect))| {
+                    Some((self.labels.index(&label)?, correct, incorrect))
+                })
+                .collect();
+            for &(label, correct, incorrect) in &labels {
                 inherited.add(label, label, correct);
                 let others: Vec<_> = (0..self.labels.len() as LabelIndex)
                     .filter(|l| *l != label)
@@ -63,6 +65,7 @@ impl WeightedVoting {
                 }
             }
             let vehicle = self.vehicle(&node);
+            self.model.label_bias.inherit(vehicle, &labels);
             self.model.vehicles[vehicle].inherited = inherited;
         }
     }
