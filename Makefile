@@ -151,19 +151,19 @@ core-only: ## prove that the core needs no runtime: it depends on a list of crat
 	packaging/check-core
 
 rooms: ## print the modules of each crate by floor, and prove that imports run downward without a circle
-	cargo test --quiet --locked --test rooms -- --nocapture
+	cargo test --quiet --locked --test core rooms:: -- --nocapture
 
 code-lines: ## count the lines of code of each room, without tests and comments
 	packaging/code-lines
 
 replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
-	cargo test --locked --release -p ecod --test replays
+	cargo test --locked --release -p ecod --test core replays::
 
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER = aarch64-linux-gnu-gcc
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER = qemu-aarch64-static -L /usr/aarch64-linux-gnu
 replay-check-arm64: PACKAGES := build-essential ca-certificates gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static
 replay-check-arm64: setup ## prove the same of the core built for arm64, under qemu; needs the Rust target aarch64-unknown-linux-gnu
-	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test replays
+	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test core replays::
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
