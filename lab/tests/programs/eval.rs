@@ -109,7 +109,7 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
 fn objects_that_move_are_judged_by_where_they_were() {
     let folder = TempDir::new().unwrap();
     let recorded = |name: &str| {
-        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name)
+        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/accuracy/eval_tracks")).join(name)
     };
     let (truth, maps, result) = (
         recorded("truth.json"),
