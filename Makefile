@@ -138,7 +138,7 @@ attack: setup ## [measure] attackers of all kinds against real cells: ROWS=text 
 
 lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-instructions/detectors -- -D warnings
+	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-actors/otel,ecod-instructions/detectors -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc
@@ -179,7 +179,7 @@ foxglove-check: setup ## a camera's log against Foxglove's published schemas, an
 	packaging/check-foxglove
 
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
-	cargo test --locked -p ecod-actors --features otel --test tracing
+	cargo test --locked -p ecod-actors --features otel --test programs spans::
 
 fuzz: setup ## [check] hostile input for decoders, evidence and fuser: SECONDS=60 or RUNS=n per target, TARGETS=payload,...
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))

@@ -8,6 +8,8 @@ mod recording;
 mod replay;
 mod schema;
 mod service;
+#[cfg(all(feature = "camera", feature = "otel"))]
+mod spans;
 #[cfg(feature = "camera")]
 mod try_pictures;
 #[cfg(feature = "camera")]
