@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::fs::{self, File};
 use std::net::SocketAddr;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -12,6 +12,7 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::routing::post;
+use ecod_testkit::{PATIENCE, car_ahead, command};
 use hyper::server::conn::http1;
 use hyper_util::rt::TokioIo;
 use hyper_util::service::TowerToHyperService;
@@ -22,8 +23,6 @@ use prost::Message;
 use tokio::net::TcpListener;
 use tokio::time::timeout;
 use uuid::Uuid;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 /// What both nodes have in their files.
 const CELL: &str = r#"
@@ -118,7 +117,7 @@ fn node(name: &str, config: &str, directory: &Path, collector: &str) -> Process 
     let file = directory.join(format!("{name}.toml"));
     fs::write(&file, format!("name = \"{name}\"\n{CELL}\n{config}")).unwrap();
     let log = File::create(directory.join(format!("{name}.log"))).unwrap();
-    let process = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+    let process = command(env!("CARGO_BIN_EXE_ecod-node"))
         .args(["--log-format", "text", "--stop-at-eof", "--config"])
         .arg(file)
         .env_remove("RUST_LOG")
@@ -151,23 +150,11 @@ async fn broker(directory: &Path) -> SocketAddr {
         .expect("the edge does not listen")
 }
 
-/// A vehicle before whose camera half a metre of car always stands.
+/// A vehicle before whose camera a car always stands.
 fn vehicle(broker: SocketAddr, directory: &Path) -> String {
-    let frames = directory.join("frames");
-    fs::create_dir(&frames).unwrap();
-    let grey = [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat();
-    fs::write(frames.join("0.ppm"), grey).unwrap();
-    let detections = directory.join("detections.jsonl");
-    let bounding_box = r#"{"x_min":300,"y_min":200,"x_max":340,"y_max":240}"#;
-    let car = format!(r#"[{{"label":"car","confidence":0.9,"bounding_box":{bounding_box}}}]"#);
-    fs::write(&detections, car).unwrap();
     format!(
-        "role = \"cav\"\n\
-         mqtt = {{ broker = \"{broker}\" }}\n\
-         [camera]\n\
-         source = {{ kind = \"images\", path = {frames:?}, looping = true }}\n\
-         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}\n\
-         projection = {{ ranging = \"box_height\", sizes.default = {{ width_m = 0.5, height_m = 0.5 }} }}\n"
+        "role = \"cav\"\nmqtt = {{ broker = \"{broker}\" }}\n[camera]\n{}",
+        car_ahead(directory)
     )
 }
 
