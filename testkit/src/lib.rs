@@ -6,6 +6,7 @@
 mod camera;
 mod cell;
 mod config;
+mod help;
 mod member;
 mod program;
 mod wait;
@@ -13,6 +14,7 @@ mod wait;
 pub use camera::car_ahead;
 pub use cell::Cell;
 pub use config::{free_gossip_address, greet, loopback, name, node_config, tls_files};
+pub use help::help_of;
 pub use member::{Member, member_config};
 pub use program::{command, output_of};
 pub use wait::{PATIENCE, until, until_by};

@@ -2,6 +2,7 @@
 //! imports between its modules.
 
 mod examples;
+mod messages;
 mod moving_on;
 mod pace;
 mod replays;
