@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -138,7 +138,7 @@ attack: setup ## [measure] attackers of all kinds against real cells: ROWS=text 
 
 lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-instructions/detectors -- -D warnings
+	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-actors/otel,ecod-instructions/detectors -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc
@@ -147,23 +147,27 @@ doc: setup ## API documentation in target/doc
 audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit
 
+snapshots: ## messages, help and error texts against their snapshots; INSTA_UPDATE=always writes these anew
+	cargo test --locked --quiet --test core messages::
+	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors::
+
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core
 
 rooms: ## print the modules of each crate by floor, and prove that imports run downward without a circle
-	cargo test --quiet --locked --test rooms -- --nocapture
+	cargo test --quiet --locked --test core rooms:: -- --nocapture
 
 code-lines: ## count the lines of code of each room, without tests and comments
 	packaging/code-lines
 
 replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
-	cargo test --locked --release -p ecod --test replays
+	cargo test --locked --release -p ecod --test core replays::
 
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER = aarch64-linux-gnu-gcc
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER = qemu-aarch64-static -L /usr/aarch64-linux-gnu
 replay-check-arm64: PACKAGES := build-essential ca-certificates gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static
 replay-check-arm64: setup ## prove the same of the core built for arm64, under qemu; needs the Rust target aarch64-unknown-linux-gnu
-	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test replays
+	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test core replays::
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
@@ -179,7 +183,7 @@ foxglove-check: setup ## a camera's log against Foxglove's published schemas, an
 	packaging/check-foxglove
 
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
-	cargo test --locked -p ecod-actors --features otel --test tracing
+	cargo test --locked -p ecod-actors --features otel --test programs spans::
 
 fuzz: setup ## [check] hostile input for decoders, evidence and fuser: SECONDS=60 or RUNS=n per target, TARGETS=payload,...
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))

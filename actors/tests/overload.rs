@@ -16,6 +16,7 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::ShedReason;
+use ecod_testkit::node_config;
 use rumqttc::{AsyncClient, ClientError, MqttOptions, QoS};
 use tokio::sync::Mutex;
 use tokio::task::JoinSet;
@@ -31,19 +32,12 @@ static ALONE: Mutex<()> = Mutex::const_new(());
 /// An edge with its broker and two locations three metres apart.
 async fn edge(change: impl FnOnce(&mut NodeConfig)) -> (NodeHandle, SocketAddr) {
     let mut config = NodeConfig {
-        name: Some(NodeName::from_static("edge")),
-        cell: NodeName::from_static("lot"),
-        role: Role::Edge,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
         landmarks: vec![
             LandmarkConfig::at("west", 0.0, 0.0),
             LandmarkConfig::at("east", 3.0, 0.0),
         ],
-        ..NodeConfig::default()
+        ..node_config("edge", "lot", Role::Edge)
     };
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     change(&mut config);
     config.validate().unwrap();
     let edge = node::start(config).await.unwrap();

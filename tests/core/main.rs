@@ -1,7 +1,11 @@
-//! The core as its users call it: fusion by PACE, tracking, VOTE, and the program that the README shows.
+//! The core as its users call it: fusion by PACE, tracking, VOTE, replays, and the program that the README shows; and the
+//! imports between its modules.
 
 mod examples;
+mod messages;
 mod moving_on;
 mod pace;
+mod replays;
+mod rooms;
 mod tracks;
 mod vote;

@@ -565,6 +565,14 @@ fn settled(nodes: usize) -> Vec<Cell> {
     vec![cold, quiet, late_edge, ready_edge, split]
 }
 
+fn everything_holds(checker: &impl Checker<CellModel>) {
+    checker.assert_no_discovery("never two leaderships with one epoch");
+    checker.assert_no_discovery("the term is on disk before it is led in");
+    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("no round is accepted twice in a row");
+    checker.assert_no_discovery("a quiet component converges");
+}
+
 #[test]
 fn three_nodes_in_every_order() {
     let model = CellModel {
@@ -582,11 +590,7 @@ fn three_nodes_in_every_order() {
         checker.state_count(),
         checker.unique_state_count()
     );
-    checker.assert_no_discovery("never two leaderships with one epoch");
-    checker.assert_no_discovery("the term is on disk before it is led in");
-    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
-    checker.assert_no_discovery("no round is accepted twice in a row");
-    checker.assert_no_discovery("a quiet component converges");
+    everything_holds(&checker);
     assert!(
         checker.unique_state_count() > 10_000,
         "the model hardly moves"
@@ -607,11 +611,7 @@ fn four_nodes_in_long_random_orders() {
         .spawn_simulation(7, UniformChooser)
         .join();
     println!("{} states on random walks", checker.state_count());
-    checker.assert_no_discovery("never two leaderships with one epoch");
-    checker.assert_no_discovery("the term is on disk before it is led in");
-    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
-    checker.assert_no_discovery("no round is accepted twice in a row");
-    checker.assert_no_discovery("a quiet component converges");
+    everything_holds(&checker);
     assert!(
         checker.discovery("two lead at once").is_some(),
         "the walks never split the cell"

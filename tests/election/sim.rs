@@ -49,45 +49,40 @@ fn a_cell_left_alone_has_the_best_leader() {
     });
 }
 
+/// Prints the gaps of all seeds; none may be longer than `most_us`.
+fn are_bounded(what: &str, most_us: u64, gap_of: impl Fn(u64) -> Option<u64>) {
+    let mut gaps = Vec::new();
+    for_seeds(seeds() / 10, |seed| {
+        gaps.extend(gap_of(seed).map(|gap| (gap, seed)));
+    });
+    report(what, &mut gaps, most_us);
+}
+
 /// A leader whose process is killed is replaced within 200 ms, seen by the worst vehicle.
 #[test]
 fn a_killed_leader_is_replaced_in_200_ms() {
-    let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, true, 1).map(|gap| (gap, seed)));
-    });
-    report("killed", &mut gaps, 200 * MS);
+    are_bounded("killed", 200 * MS, |seed| failover_gap(seed, true, 1));
 }
 
 /// A leader killed together with its standby is replaced within 200 ms too.
 #[test]
 fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
-    let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, true, 2).map(|gap| (gap, seed)));
+    are_bounded("killed with its standby", 200 * MS, |seed| {
+        failover_gap(seed, true, 2)
     });
-    report("killed with its standby", &mut gaps, 200 * MS);
 }
 
 /// A leader that falls silent is replaced within 400 ms, seen by the worst vehicle.
 #[test]
 fn a_silent_leader_is_replaced_in_400_ms() {
-    let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, false, 1).map(|gap| (gap, seed)));
-    });
-    report("silent", &mut gaps, 400 * MS);
+    are_bounded("silent", 400 * MS, |seed| failover_gap(seed, false, 1));
 }
 
 /// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is;
 /// and the sides become one without a quarrel.
 #[test]
 fn a_side_without_the_leader_has_its_own_in_400_ms() {
-    let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| {
-        gaps.extend(split_gap(seed).map(|gap| (gap, seed)));
-    });
-    report("split", &mut gaps, 400 * MS);
+    are_bounded("split", 400 * MS, split_gap);
 }
 
 /// An edge that returns is handed the lead, and no vehicle misses a round or takes one twice; 5 % of packets are lost.

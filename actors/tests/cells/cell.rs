@@ -12,32 +12,17 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::observe::recorder::RecordConfig;
 use ecod_actors::platform::clock;
+use ecod_testkit::node_config;
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
 fn config(name: &str, role: Role) -> NodeConfig {
-    let slot = |n: i32| LandmarkConfig {
-        id: format!("slot-{n}").into(),
-        x_m: f64::from(n) * 3.0,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let mut config = NodeConfig {
-        name: Some(NodeName::new(name).unwrap()),
-        cell: NodeName::from_static("lot-1"),
-        role,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
+    let slot = |n: i32| LandmarkConfig::at(format!("slot-{n}"), f64::from(n) * 3.0, 0.0);
+    NodeConfig {
         landmarks: (0..3).map(slot).collect(),
-        ..NodeConfig::default()
-    };
-    // Cells of other tests are not met.
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
-    config
+        ..node_config(name, "lot-1", role)
+    }
 }
 
 async fn edge() -> NodeHandle {

@@ -12,17 +12,17 @@ use std::time::{Duration, Instant};
 
 use ecod::leadership::Position;
 use ecod::wire::Role;
-use ecod_actors::node::config::NodeConfig;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
+use ecod_testkit::Cell;
 
-use cell::Cell;
+use cell::{config, record};
 use path::Path;
 
 /// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead
 /// back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn maps_go_on_without_the_edge_and_with_it_again() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for (name, role) in [
         ("edge", Role::Edge),
         ("euclid", Role::Auto),
@@ -37,7 +37,7 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
     let substitute = cell.served_by_another_than("edge").await;
     assert_ne!(substitute, "edge");
     for name in ["euclid", "gauss", "noether"] {
-        let record = cell.record(name);
+        let record = record(&cell, name);
         record.never_goes_back();
         eprintln!(
             "{name}: longest gap when the edge was killed {:?}",
@@ -46,12 +46,12 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
         assert!(record.longest_gap() < Duration::from_secs(5));
     }
 
-    let before = cell.record("euclid").last_round();
+    let before = record(&cell, "euclid").last_round();
     cell.start("edge", Role::Edge).await;
     cell.served_by("edge").await;
     tokio::time::sleep(Duration::from_millis(500)).await;
     for name in ["euclid", "gauss", "noether"] {
-        let record = cell.record(name);
+        let record = record(&cell, name);
         record.never_goes_back();
         record.misses_and_repeats_none_after(before, "edge");
     }
@@ -61,7 +61,7 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
 /// Those that are left find a leader when the leader and the one named to follow it end together.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_cell_outlives_its_leader_and_standby() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for name in ["euclid", "gauss", "noether", "turing"] {
         cell.start(name, Role::Auto).await;
     }
@@ -71,7 +71,7 @@ async fn a_cell_outlives_its_leader_and_standby() {
     cell.kill(&standby);
     cell.served_by_another_than("euclid").await;
     for name in cell.names() {
-        let record = cell.record(&name);
+        let record = record(&cell, &name);
         record.never_goes_back();
         eprintln!(
             "{name}: longest gap when leader and standby were killed {:?}",
@@ -84,7 +84,7 @@ async fn a_cell_outlives_its_leader_and_standby() {
 /// A vehicle that finds nobody serves itself, and remembers its term when it starts again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     cell.start("euclid", Role::Auto).await;
     cell.served_by("euclid").await;
     let first = cell.leadership("euclid").epoch.unwrap();
@@ -93,14 +93,14 @@ async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
     cell.served_by("euclid").await;
     let second = cell.leadership("euclid").epoch.unwrap();
     assert!(second.term > first.term, "{second} after {first}");
-    cell.record("euclid").never_goes_back();
+    record(&cell, "euclid").never_goes_back();
     cell.stop().await;
 }
 
 /// A leader that loses its broker stops leading at once; an edge is handed the lead again when it is whole.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for (name, role) in [("euclid", Role::Edge), ("gauss", Role::Auto)] {
         cell.start(name, role).await;
     }
@@ -119,7 +119,7 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
         cell.standby_is_named().await;
     }
     for name in ["euclid", "gauss"] {
-        cell.record(name).never_goes_back();
+        record(&cell, name).never_goes_back();
     }
     cell.stop().await;
 }
@@ -132,14 +132,13 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
         .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
         .unwrap();
     let (first, second) = (Path::to(address).await, Path::to(address).await);
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for (name, path) in [("euclid", &first), ("gauss", &second)] {
-        let through = |config: &mut NodeConfig| {
-            config.mqtt.broker = Some(path.address.into());
-            // The protocol's own signs of life tell nothing in here.
-            config.mqtt.keep_alive_s = 600;
-        };
-        cell.start_with(name, Role::Auto, through).await;
+        let mut config = cell.config(name, Role::Auto);
+        config.mqtt.broker = Some(path.address.into());
+        // The protocol's own signs of life tell nothing in here.
+        config.mqtt.keep_alive_s = 600;
+        cell.start_with(config).await;
     }
     cell.served_by("euclid").await;
     cell.standby_is_named().await;
@@ -172,7 +171,7 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
 /// A vehicle of role `cav` follows whoever leads and never leads itself.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_cav_follows_the_election_and_takes_no_part_in_leading() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for (name, role) in [
         ("euclid", Role::Auto),
         ("gauss", Role::Cav),
@@ -187,6 +186,6 @@ async fn a_cav_follows_the_election_and_takes_no_part_in_leading() {
     cell.kill("noether");
     tokio::time::sleep(Duration::from_secs(3)).await;
     assert_ne!(cell.leadership("gauss").position, Position::Leading);
-    cell.record("gauss").never_goes_back();
+    record(&cell, "gauss").never_goes_back();
     cell.stop().await;
 }

@@ -2,23 +2,20 @@
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::ops::Deref;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
-use ecod::wire::Role;
-use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
-use ecod_actors::platform::clock;
 use ecod_actors::platform::secret::Secret;
 use ecod_actors::transport::gossip::{
-    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent, MulticastConfig,
+    FrameEvent, Member as Seen, MembershipConfig, MembershipEvent, MulticastConfig,
 };
-use ractor::{Actor, ActorRef, call_t};
+use ecod_testkit::{Member, member_config};
 use tokio::net::UdpSocket;
-use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
 /// Long enough for a loaded machine.
@@ -26,73 +23,43 @@ const SOON: Duration = Duration::from_secs(20);
 /// Where every node says that its broker listens.
 const BROKER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 1883);
 
-struct Node {
-    name: NodeName,
-    actor: ActorRef<MembershipMessage>,
-    address: SocketAddr,
-    events: Arc<Mutex<Vec<MembershipEvent>>>,
-    members: watch::Receiver<Vec<Member>>,
-    counters: Arc<FrameCounters>,
-}
+/// A node's membership, as its tests look at it.
+struct Node(Member);
 
 /// A node on a free port of loopback, with a key, without multicast.
 fn config(seeds: &[SocketAddr]) -> MembershipConfig {
     MembershipConfig {
-        key: Some(Secret::new("5e".repeat(32))),
-        bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
-        seeds: seeds.iter().map(ToString::to_string).collect(),
-        multicast: MulticastConfig {
-            enabled: false,
-            ..MulticastConfig::default()
-        },
         // Patient, as the machine that runs this may be busy.
         probe_ms: 200,
         reply_ms: 80,
         suspect_ms: 600,
-        ..MembershipConfig::default()
+        ..member_config(seeds)
+    }
+}
+
+impl Deref for Node {
+    type Target = Member;
+
+    fn deref(&self) -> &Member {
+        &self.0
     }
 }
 
 impl Node {
     async fn start(name: &str, config: MembershipConfig) -> Self {
-        let events = Arc::<Mutex<Vec<_>>>::default();
-        let (sink, counters) = (Arc::clone(&events), Arc::<FrameCounters>::default());
-        let (sender, members) = watch::channel(Vec::new());
-        let name = NodeName::new(name).unwrap();
-        let arguments = MembershipArguments {
-            name: name.clone(),
-            cell: NodeName::from_static("lot-1"),
-            run: clock::now().micros(),
-            role: Role::Auto,
-            broker: Some(BROKER),
-            credentials: None,
-            config,
-            events: Arc::new(move |event| sink.lock().unwrap().push(event)),
-            members: sender,
-            counters: Arc::clone(&counters),
-        };
-        let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
-        let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-        Self {
-            name,
-            actor,
-            address,
-            events,
-            members,
-            counters,
-        }
+        Self(Member::start(name, config, |arguments| arguments.broker = Some(BROKER)).await)
     }
 
     async fn sees(&mut self, names: &[&str]) {
         let wanted: BTreeSet<_> = names.iter().copied().collect();
-        let complete = |members: &Vec<Member>| {
+        let complete = |members: &Vec<Seen>| {
             members
                 .iter()
                 .map(|member| member.name.as_str())
                 .collect::<BTreeSet<_>>()
                 == wanted
         };
-        let seen = timeout(SOON, self.members.wait_for(complete))
+        let seen = timeout(SOON, self.0.members.wait_for(complete))
             .await
             .map(|_| ());
         assert!(
@@ -170,14 +137,14 @@ async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
 async fn datagrams_and_broker_addresses_reach_the_others() {
     let mut nodes = five().await;
     let payload = Bytes::from_static(b"who leads?");
-    let reached = |members: &Vec<Member>| {
+    let reached = |members: &Vec<Seen>| {
         let member = members
             .iter()
             .find(|member| member.name.as_str() == "node-2");
         member.and_then(|member| member.broker) == Some(SocketAddr::from(([127, 0, 0, 1], 1883)))
     };
     assert!(
-        timeout(SOON, nodes[4].members.wait_for(reached))
+        timeout(SOON, nodes[4].0.members.wait_for(reached))
             .await
             .is_ok()
     );

@@ -7,7 +7,6 @@ use std::process::Command;
 use std::time::Duration;
 
 use ecod::model::geometry::wrap_angle;
-use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Limits, ObjectReport, Role, decode};
@@ -16,6 +15,7 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::{car_ahead, node_config};
 use rumqttc::{AsyncClient, Event as Packets, EventLoop, MqttOptions, Packet, QoS};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpStream, UdpSocket};
@@ -24,8 +24,7 @@ use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Half a metre of car, 40 pixels high: 6.6 m ahead of the default camera.
-const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
+/// How far ahead the car of [`car_ahead`] stands.
 const AHEAD_M: f64 = 6.6;
 
 const SPEED_MPS: f64 = 2.0;
@@ -36,61 +35,24 @@ fn x_m(started: Timestamp, at: Timestamp) -> f64 {
     (SPEED_MPS * at.since(started).as_secs_f64()).min(STOPS_AT_M)
 }
 
-fn cell() -> NodeConfig {
-    let mut config = NodeConfig {
-        cell: NodeName::from_static("road"),
+fn config(name: &str, role: Role) -> NodeConfig {
+    NodeConfig {
         landmarks: vec![LandmarkConfig::at("spot", STOPS_AT_M + AHEAD_M, 0.0)],
-        ..NodeConfig::default()
-    };
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
-    config
+        ..node_config(name, "road", role)
+    }
 }
 
 async fn edge() -> NodeHandle {
-    let name = Some(NodeName::from_static("edge"));
-    let listen = Some("127.0.0.1:0".parse().unwrap());
-    node::start(NodeConfig {
-        name,
-        role: Role::Edge,
-        listen,
-        ..cell()
-    })
-    .await
-    .unwrap()
+    node::start(config("edge", Role::Edge)).await.unwrap()
 }
 
 /// A vehicle that always has half a metre of car ahead.
-fn vehicle(name: &'static str, pose: PoseConfig, directory: &Path) -> NodeConfig {
-    let directory = directory.join(name);
-    std::fs::create_dir(&directory).unwrap();
-    let frames = directory.join("frames");
-    std::fs::create_dir(&frames).unwrap();
-    std::fs::write(
-        frames.join("0.ppm"),
-        [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat(),
-    )
-    .unwrap();
-    let detections = directory.join("detections.jsonl");
-    std::fs::write(&detections, DETECTIONS).unwrap();
-    let camera = format!(
-        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\n\
-         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}\n\
-         projection = {{ ranging = \"box_height\", sizes.default = {{ width_m = 0.5, height_m = 0.5 }} }}"
-    );
-    let camera = Some(toml::from_str(&camera).unwrap());
-    let (name, listen) = (
-        Some(NodeName::from_static(name)),
-        Some("127.0.0.1:0".parse().unwrap()),
-    );
+fn vehicle(name: &str, pose: PoseConfig, directory: &Path) -> NodeConfig {
+    let camera = car_ahead(&directory.join(name));
     let config = NodeConfig {
-        name,
-        role: Role::Cav,
-        listen,
         pose,
-        camera,
-        ..cell()
+        camera: Some(toml::from_str(&camera).unwrap()),
+        ..config(name, Role::Cav)
     };
     config.validate().unwrap();
     config

@@ -6,7 +6,6 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{Limits, ObjectReport, Role, decode};
@@ -15,6 +14,7 @@ use ecod_actors::node::roaming::Roamer;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, CityTlsConfig, TlsConfig};
+use ecod_testkit::{car_ahead, loopback, name, node_config};
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
 use tempfile::TempDir;
 use tokio::net::UdpSocket;
@@ -22,9 +22,6 @@ use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 const PATIENCE: Duration = Duration::from_secs(40);
-
-/// Half a metre of car, 40 pixels high: 6.6 m ahead of the default camera.
-const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
 
 /// Middles of the cells: 300 m apart, from west to east.
 fn middle(cell: usize) -> GeographicOrigin {
@@ -42,28 +39,9 @@ fn middle(cell: usize) -> GeographicOrigin {
     }
 }
 
-fn loopback() -> SocketAddr {
-    "127.0.0.1:0".parse().unwrap()
-}
-
 /// A node of a cell on this machine alone.
 fn config(cell: usize, name: &str, role: Role) -> NodeConfig {
-    let cell = self::name(&format!("lot-{cell}"));
-    let mut config = NodeConfig {
-        cell,
-        name: Some(self::name(name)),
-        role,
-        ..NodeConfig::default()
-    };
-    config.listen = Some(loopback());
-    config.membership.bind = Some(loopback());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
-    config
-}
-
-fn name(text: &str) -> NodeName {
-    NodeName::new(text).unwrap()
+    node_config(name, &format!("lot-{cell}"), role)
 }
 
 /// Number of cells on the road.
@@ -322,7 +300,7 @@ impl Town {
         // A cell elsewhere, the key of which is missing.
         cells += "[[cells]]\nname = \"lot-9\"\nlatitude_deg = 0\nlongitude_deg = 0\nkey_file = \"lot-9.key\"\n";
         std::fs::write(directory.join("cells.toml"), cells).unwrap();
-        let camera = camera(directory);
+        let camera = car_ahead(directory);
         let mut config = config(0, "euclid", role);
         (config.cells, config.map_log) = (
             Some(directory.join("cells.toml")),
@@ -342,23 +320,6 @@ impl Town {
             edge.stop().await;
         }
     }
-}
-
-fn camera(directory: &Path) -> String {
-    let frames = directory.join("frames");
-    std::fs::create_dir_all(&frames).unwrap();
-    std::fs::write(
-        frames.join("0.ppm"),
-        [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat(),
-    )
-    .unwrap();
-    let detections = directory.join("detections.jsonl");
-    std::fs::write(&detections, DETECTIONS).unwrap();
-    format!(
-        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\n\
-         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}\n\
-         projection = {{ ranging = \"box_height\", sizes.default = {{ width_m = 0.5, height_m = 0.5 }} }}"
-    )
 }
 
 /// Tells the vehicle at 20 Hz where it is, heading east.

@@ -12,38 +12,14 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
-use tokio::time::timeout;
+use ecod_testkit::{node_config, until_by as until};
 use uuid::Uuid;
 
-const PATIENCE: Duration = Duration::from_secs(30);
-
 fn config(node: &'static str, role: Role) -> NodeConfig {
-    let mut config = NodeConfig {
-        name: Some(NodeName::from_static(node)),
-        cell: NodeName::from_static("road"),
-        role,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
-        ..NodeConfig::default()
-    };
+    let mut config = node_config(node, "road", role);
     config.fusion.algorithms = Algorithms::Pace;
     config.reputations.publish_period_s = 0.1;
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config
-}
-
-/// Lets time pass, with `act` every 20 ms, until `is_reached`.
-async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool) {
-    let reached = async {
-        while !is_reached() {
-            act();
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    };
-    timeout(PATIENCE, reached)
-        .await
-        .unwrap_or_else(|_| panic!("never: {what}"));
 }
 
 /// Has two vehicles see the same two cars, or rather have seen them some time ago.

@@ -7,7 +7,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use ecod::aggregator::Algorithms;
-use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
 use ecod::wire::{
@@ -20,37 +19,16 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::{name, node_config, until_by as until};
 use tokio::time::timeout;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-fn name(name: &str) -> NodeName {
-    NodeName::new(name).unwrap()
-}
-
 fn config(node: &str, role: Role) -> NodeConfig {
-    let ball = LandmarkConfig {
-        id: "ball".into(),
-        x_m: 1.0,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let mut config = NodeConfig {
-        name: Some(name(node)),
-        cell: NodeName::from_static("crossing"),
-        role,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
-        landmarks: vec![ball],
-        ..NodeConfig::default()
-    };
+    let mut config = node_config(node, "crossing", role);
+    config.landmarks = vec![LandmarkConfig::at("ball", 1.0, 0.0)];
     config.fusion.vote.weighted.freshness_s = 0.2;
     config.reputations.publish_period_s = 0.1;
-    // Cells of other tests are not met.
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config
 }
 
@@ -104,19 +82,6 @@ fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
             clock::now(),
         )
     })
-}
-
-/// Lets time pass, with `act` every 20 ms, until `is_reached`.
-async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool) {
-    let reached = async {
-        while !is_reached() {
-            act();
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    };
-    timeout(PATIENCE, reached)
-        .await
-        .unwrap_or_else(|_| panic!("never: {what}"));
 }
 
 /// Has two vehicles say cup and a third say dog, all over the third's connection to the broker.

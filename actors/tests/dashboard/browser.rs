@@ -76,12 +76,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
         browser
             .screenshot(&pictures.join(format!("{name}.png")))
             .await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}: the page scrolls sideways"
-        );
+        browser.fits_the_width(name).await;
         let cut_off = "[...document.querySelectorAll('.scroll')].filter((it) => it.scrollWidth > it.clientWidth + 1)\
                        .map((it) => it.getAttribute('aria-labelledby')).join()";
         if width >= 1440 {

@@ -214,12 +214,7 @@ async fn a_box_and_its_object_light_up_together() {
             .await;
         tokio::time::sleep(Duration::from_secs(1)).await;
         browser.screenshot(&shots.join(format!("{name}.png"))).await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}: the page scrolls sideways"
-        );
+        browser.fits_the_width(name).await;
     }
     browser.look(1440, 900, "light").await;
     browser
@@ -236,9 +231,7 @@ async fn a_box_and_its_object_light_up_together() {
             "{lit_labels} === 'person' && {lit_boxes} === 'person 87 %'"
         ))
         .await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     until("no more are made", || async {
         shown_after(&node, Duration::from_millis(600)).await == 0
     })
@@ -340,12 +333,7 @@ async fn each_of_several_cameras_can_be_looked_at() {
             .await;
         tokio::time::sleep(Duration::from_secs(1)).await;
         browser.screenshot(&shots.join(format!("{name}.png"))).await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}: the page scrolls sideways"
-        );
+        browser.fits_the_width(name).await;
     }
     browser.look(1440, 900, "light").await;
     browser
@@ -358,8 +346,7 @@ async fn each_of_several_cameras_can_be_looked_at() {
             rows(1)
         ))
         .await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     until("no more are made", || async {
         shown_after(&node, Duration::from_millis(600)).await == 0
     })

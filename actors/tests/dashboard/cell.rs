@@ -10,6 +10,7 @@ use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, Wir
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
+use ecod_testkit::{loopback, node_config};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
 
@@ -20,26 +21,16 @@ pub(crate) fn config(name: &str, role: Role, landmarks: usize) -> NodeConfig {
     let landmark = |index: usize| {
         let (x_m, y_m) = place(index);
         LandmarkConfig {
-            id: format!("slot-{index}").into(),
-            x_m,
-            y_m,
             facing_deg: Some(if y_m > 0.0 { -90.0 } else { 90.0 }),
-            vacancy: None,
-            synonyms: Default::default(),
+            ..LandmarkConfig::at(format!("slot-{index}"), x_m, y_m)
         }
     };
-    let loopback = || SocketAddr::from(([127, 0, 0, 1], 0));
     let mut config = NodeConfig {
-        name: Some(NodeName::new(name).unwrap()),
-        cell: NodeName::from_static("lot"),
-        role,
-        listen: Some(loopback()),
         landmarks: (0..landmarks).map(landmark).collect(),
-        ..NodeConfig::default()
+        ..node_config(name, "lot", role)
     };
+    config.dashboard.enabled = true;
     config.dashboard.listen = Some(loopback());
-    config.membership.bind = Some(loopback());
-    config.membership.multicast.enabled = false;
     config.reputations.publish_period_s = 0.2;
     config
 }

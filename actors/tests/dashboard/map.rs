@@ -180,12 +180,7 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
         browser
             .screenshot(&shots().join(format!("{name}.png")))
             .await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}: the page scrolls sideways"
-        );
+        browser.fits_the_width(name).await;
     }
     browser.look(1280, 800, "light").await;
     browser
@@ -219,8 +214,7 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
         .evaluate("document.querySelector('#timeline-live').click()")
         .await;
     browser.until(&format!("{pieces} >= 3")).await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     node.stop().await;
 }
 
@@ -293,8 +287,7 @@ async fn terms_are_explained() {
     browser.screenshot(&shots().join("term.png")).await;
     browser.point_at("#cell").await;
     browser.until(&format!("{tip} === ''")).await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     node.stop().await;
 }
 
@@ -391,8 +384,7 @@ async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
             .screenshot(&shots().join(format!("{name}.png")))
             .await;
     }
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     node.stop().await;
 }
 

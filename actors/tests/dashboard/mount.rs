@@ -330,12 +330,7 @@ async fn a_mount_is_clicked_corrected_and_copied_in_the_page() {
         browser
             .screenshot(&shots().join(format!("{name}.png")))
             .await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}: the page scrolls sideways"
-        );
+        browser.fits_the_width(name).await;
     }
     browser.look(1280, 1000, "light").await;
     browser
@@ -382,7 +377,6 @@ async fn a_mount_is_clicked_corrected_and_copied_in_the_page() {
     browser
         .until("document.querySelectorAll('#map path.pick').length === 0")
         .await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
     node.stop().await;
 }

@@ -39,12 +39,7 @@ async fn pictures(browser: &Browser, name: &str) {
         browser
             .screenshot(&pictures.join(format!("{name}-{look}.png")))
             .await;
-        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(
-            browser.evaluate(wider).await,
-            false,
-            "{name}, {look}: the page scrolls sideways"
-        );
+        browser.fits_the_width(&format!("{name}, {look}")).await;
     }
     browser.look(1440, 900, "light").await;
 }
@@ -126,8 +121,7 @@ async fn a_browser_scrubs_back_to_the_map_before_the_edge_was_lost() {
             .await,
         true
     );
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
 }
 
 /// The report about a log has the same timeline, with the map and the camera's picture at the cursor.
@@ -219,6 +213,5 @@ async fn a_report_shows_what_was_seen_at_the_cursor() {
     browser
         .until("document.querySelectorAll('#places tr').length >= 12")
         .await;
-    assert_eq!(browser.complaints().await, Vec::<String>::new());
-    browser.quit().await;
+    browser.quit_without_complaints().await;
 }

@@ -215,6 +215,21 @@ impl Browser {
             .collect()
     }
 
+    /// The page as it looks now must not scroll sideways.
+    pub(crate) async fn fits_the_width(&self, what: &str) {
+        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
+        assert_eq!(
+            self.evaluate(wider).await,
+            false,
+            "{what}: the page scrolls sideways"
+        );
+    }
+
+    pub(crate) async fn quit_without_complaints(self) {
+        assert_eq!(self.complaints().await, Vec::<String>::new());
+        self.quit().await;
+    }
+
     pub(crate) async fn quit(self) {
         request(
             self.driver,

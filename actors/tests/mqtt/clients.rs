@@ -14,29 +14,18 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
+use ecod_testkit::{node_config, tls_files};
 
 /// An edge of the cell that the documentation speaks of.
 async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
-    let landmark = |id: &str, x_m| LandmarkConfig {
-        id: id.into(),
-        x_m,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let mut config = NodeConfig {
-        name: Some(NodeName::from_static("edge")),
-        cell: NodeName::from_static("lot-1"),
-        role: Role::Edge,
-        listen: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
-        landmarks: vec![landmark("slot-0", 0.0), landmark("slot-1", 2.5)],
+    let config = NodeConfig {
+        landmarks: vec![
+            LandmarkConfig::at("slot-0", 0.0, 0.0),
+            LandmarkConfig::at("slot-1", 2.5, 0.0),
+        ],
         tls,
-        ..NodeConfig::default()
+        ..node_config("edge", "lot-1", Role::Edge)
     };
-    config.membership.bind = Some(SocketAddr::from(([127, 0, 0, 1], 0)));
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config.validate().unwrap();
     let node = node::start(config).await.unwrap();
     let mut maps = node.newest_map();
@@ -157,16 +146,12 @@ async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
     authority
         .issue(&name, Role::Edge, Duration::from_secs(86_400), clock::now())
         .unwrap();
-    let (certificate, key) = authority.files_of(&name);
-    std::fs::copy(&certificate, directory.path().join("node.pem")).unwrap();
-    std::fs::copy(&key, directory.path().join("node.key")).unwrap();
     let tls = TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
         revocation_list: None,
-        city: None,
+        ..tls_files(&authority, &name)
     };
+    std::fs::copy(&tls.certificate, directory.path().join("node.pem")).unwrap();
+    std::fs::copy(&tls.key, directory.path().join("node.key")).unwrap();
     let (node, broker) = edge(Some(tls)).await;
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");

@@ -5,16 +5,10 @@ use std::process::{Command, Output, Stdio};
 
 use ecod::model::names::NodeName;
 use ecod_actors::platform::state_file::StateFile;
+use ecod_testkit::command;
 
 fn ecod_node() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in
-        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
-    {
-        command.env_remove(key);
-    }
-    command.stdin(Stdio::null());
-    command
+    command(env!("CARGO_BIN_EXE_ecod-node"))
 }
 
 fn stderr(output: &Output) -> String {

@@ -1,13 +1,19 @@
-//! `ecod-node` as its users run it: commands, configurations, pictures and videos, logs, and the service.
+//! `ecod-node` as its users run it: commands, help, configurations, errors, pictures and videos, logs, and the service.
 
 #[cfg(feature = "camera")]
 mod calibrate_mount;
 mod cli;
+#[cfg(feature = "camera")]
+mod errors;
 mod example_configurations;
+#[cfg(feature = "camera")]
+mod help;
 mod recording;
 mod replay;
 mod schema;
 mod service;
+#[cfg(all(feature = "camera", feature = "otel"))]
+mod spans;
 #[cfg(feature = "camera")]
 mod try_pictures;
 #[cfg(feature = "camera")]

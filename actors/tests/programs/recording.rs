@@ -17,8 +17,9 @@ use ecod::perception::landmark::LandmarkConfig;
 use ecod::replay::FusedLine;
 use ecod::wire::Role;
 use ecod_actors::observe::recorder::{SchemaName, files};
+use ecod_testkit::{Cell, name};
 
-use cell::{Cell, Log, name};
+use cell::{Log, config, drive};
 
 /// The lines that a replay of a node's log writes, and what it says.
 fn replay(log: &std::path::Path) -> (Vec<FusedLine>, String) {
@@ -64,7 +65,7 @@ fn by_key(lines: &[FusedLine]) -> BTreeMap<(String, u64, u64, bool), String> {
 /// Every map and verdict of every leader comes out of its log again, to the last bit, across a failover and back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_every_leader_made_is_made_again_from_its_log() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     for (node, role) in [
         ("edge", Role::Edge),
         ("euclid", Role::Auto),
@@ -73,13 +74,13 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
         cell.start(node, role).await;
     }
     cell.served_by("edge").await;
-    cell.drive(Duration::from_secs(3)).await;
+    drive(&cell, Duration::from_secs(3)).await;
     cell.kill("edge");
     let substitute = cell.served_by_another_than("edge").await;
-    cell.drive(Duration::from_secs(2)).await;
+    drive(&cell, Duration::from_secs(2)).await;
     cell.start("edge", Role::Edge).await;
     cell.served_by("edge").await;
-    cell.drive(Duration::from_secs(2)).await;
+    drive(&cell, Duration::from_secs(2)).await;
     let directory = cell.stop().await;
 
     let mut leaders = Vec::new();
@@ -126,11 +127,11 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
 /// An edit between two runs of a node holds for the second alone, also when both are made again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn every_run_is_made_again_under_its_own_configuration() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     cell.start("edge", Role::Edge).await;
     cell.start("euclid", Role::Cav).await;
     cell.served_by("edge").await;
-    cell.drive(Duration::from_secs(1)).await;
+    drive(&cell, Duration::from_secs(1)).await;
     cell.kill("edge");
     let mut config = cell.config("edge", Role::Edge);
     config
@@ -138,7 +139,7 @@ async fn every_run_is_made_again_under_its_own_configuration() {
         .push(LandmarkConfig::at("slot-2", 6.0, 1.0));
     cell.start_with(config).await;
     cell.served_by("edge").await;
-    cell.drive(Duration::from_secs(2)).await;
+    drive(&cell, Duration::from_secs(2)).await;
     let directory = cell.stop().await;
 
     let dir = directory.path().join("edge");
@@ -163,7 +164,7 @@ async fn every_run_is_made_again_under_its_own_configuration() {
 /// An observer's log has what all of the cell said, and the reports in it can be fused, also those of several runs.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_observer_records_what_all_say() {
-    let mut cell = Cell::default();
+    let mut cell = Cell::new(config);
     cell.start("edge", Role::Edge).await;
     cell.start("euclid", Role::Auto).await;
     cell.served_by("edge").await;
@@ -200,7 +201,7 @@ async fn an_observer_records_what_all_say() {
                 .then_some(())
         })
         .await;
-        cell.drive(time).await;
+        drive(&cell, time).await;
         observer.terminate();
     }
     let _directory = cell.stop().await;

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod_testkit::{command, output_of};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tempfile::TempDir;
@@ -90,12 +91,7 @@ impl Drop for Service {
 }
 
 fn program() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in
-        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
-    {
-        command.env_remove(key);
-    }
+    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
     command
         .env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false")
         .env("ECOD_DASHBOARD__ENABLED", "false");
@@ -268,15 +264,10 @@ fn the_unit_fits_the_program() {
         assert!(unit.lines().any(|other| other == line), "{line}");
     }
     let installed = packaging.join("debian/node.toml");
-    let output = program()
-        .arg("--config")
-        .arg(installed)
-        .arg("--print-config")
-        .output()
-        .unwrap();
-    assert!(
-        output.status.success(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
+    output_of(
+        program()
+            .arg("--config")
+            .arg(installed)
+            .arg("--print-config"),
     );
 }

@@ -8,6 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use ecod_actors::camera::image_codec;
+use ecod_testkit::command;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use opencv::core::{BORDER_CONSTANT, Mat, Scalar, copy_make_border};
@@ -17,14 +18,8 @@ use serde_json::Value;
 const PATIENCE: Duration = Duration::from_secs(120);
 
 fn ecod_node() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in
-        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
-    {
-        command.env_remove(key);
-    }
+    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
     command.env_remove("RUST_LOG");
-    command.stdin(Stdio::null());
     command
 }
 
@@ -85,6 +80,15 @@ fn label(object: &Value) -> String {
     object["label"].as_str().unwrap().to_owned()
 }
 
+/// The address of a page that the program prints behind this word.
+fn address(lines: &mut impl Iterator<Item = String>, page: &str) -> String {
+    let address = |line: String| {
+        let (name, address) = line.split_once(": http://")?;
+        Some(address.split('/').next()?.to_owned()).filter(|_| name == page)
+    };
+    lines.find_map(address).unwrap()
+}
+
 /// Labels and distances from the first vehicle of the objects on the map that the page shows.
 fn objects(page: &str) -> Option<Vec<(String, f64)>> {
     let distance_m = |object: &Value| {
@@ -138,26 +142,8 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
     let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
-    let page = lines
-        .find_map(|line| {
-            Some(
-                line.strip_prefix("page: http://")?
-                    .split('/')
-                    .next()?
-                    .to_owned(),
-            )
-        })
-        .unwrap();
-    let second = lines
-        .find_map(|line| {
-            Some(
-                line.strip_prefix("page of images-2: http://")?
-                    .split('/')
-                    .next()?
-                    .to_owned(),
-            )
-        })
-        .unwrap();
+    let page = address(&mut lines, "page");
+    let second = address(&mut lines, "page of images-2");
     let (sender, progress) = std::sync::mpsc::channel();
     std::thread::spawn(move || lines.try_for_each(|line| sender.send(line)));
 
@@ -226,16 +212,7 @@ fn without_a_source_a_street_is_shown_by_two_cameras() {
     let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
-    let page = lines
-        .find_map(|line| {
-            Some(
-                line.strip_prefix("page: http://")?
-                    .split('/')
-                    .next()?
-                    .to_owned(),
-            )
-        })
-        .unwrap();
+    let page = address(&mut lines, "page");
     std::thread::spawn(move || lines.for_each(drop));
     let deadline = Instant::now() + PATIENCE;
     let seen_by = |object: &Value, names: &[&str]| {

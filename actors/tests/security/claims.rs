@@ -7,12 +7,29 @@ use uuid::Uuid;
 
 use crate::fixture::{Cell, Client, DAY, client_config};
 
+/// A client with a certificate of the vehicle `gauss` that has logged in.
+async fn log_in(cell: &mut Cell, client: &str, role: Role) -> Client {
+    let files = cell.pki.issue("gauss", role, DAY);
+    let mut gauss = Client::new(cell.address, client, &client_config("gauss", &files));
+    gauss.log_in().await.unwrap();
+    gauss
+}
+
+/// Each of these publications must be denied, and counted once; none was denied before.
+async fn are_denied(cell: &Cell, client: &mut Client, topics: &[&str], retain: bool) {
+    for (denied, topic) in (1..).zip(topics) {
+        client
+            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), retain)
+            .await
+            .unwrap();
+        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
+    }
+}
+
 #[tokio::test]
 async fn nobody_speaks_on_the_topics_of_another() {
     let mut cell = Cell::start().await;
-    let files = cell.pki.issue("gauss", Role::Auto, DAY);
-    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
-    gauss.log_in().await.unwrap();
+    let mut gauss = log_in(&mut cell, "gauss", Role::Auto).await;
     let others = [
         "detections/euclid",
         "vote_detections/euclid",
@@ -21,13 +38,7 @@ async fn nobody_speaks_on_the_topics_of_another() {
     ];
     // The last three are for the elected alone, which the broker's node knows from authenticated datagrams.
     let elected = ["global_detections", "global_verdicts", "reputations"];
-    for (denied, topic) in (1..).zip(others.into_iter().chain(elected)) {
-        gauss
-            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
-            .await
-            .unwrap();
-        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
-    }
+    are_denied(&cell, &mut gauss, &[&others[..], &elected].concat(), false).await;
     let counts = cell.counters.rejects_by_source();
     let by_gauss = counts
         .iter()
@@ -40,37 +51,27 @@ async fn nobody_speaks_on_the_topics_of_another() {
 #[tokio::test]
 async fn one_certificate_is_one_vehicle() {
     let mut cell = Cell::start().await;
-    let files = cell.pki.issue("gauss", Role::Auto, DAY);
-    let mut gauss = Client::new(cell.address, "gauss--2", &client_config("gauss", &files));
-    gauss.log_in().await.unwrap();
+    let mut gauss = log_in(&mut cell, "gauss--2", Role::Auto).await;
     // Its parts may report, and count as the vehicle; they have no evidence, nor are others' parts its own.
-    for (denied, topic) in (1..).zip([
-        "detections/gauss-2",
-        "vote_detections/euclid--2",
-        "ledger/gauss--2",
-    ]) {
-        gauss
-            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
-            .await
-            .unwrap();
-        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
-    }
+    are_denied(
+        &cell,
+        &mut gauss,
+        &[
+            "detections/gauss-2",
+            "vote_detections/euclid--2",
+            "ledger/gauss--2",
+        ],
+        false,
+    )
+    .await;
     cell.honest_traffic_goes_on().await;
 }
 
 #[tokio::test]
 async fn a_vehicle_that_never_leads_shares_no_evidence_and_describes_no_cell() {
     let mut cell = Cell::start().await;
-    let files = cell.pki.issue("gauss", Role::Cav, DAY);
-    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
-    gauss.log_in().await.unwrap();
-    for (denied, topic) in (1..).zip(["ledger/gauss", "cell"]) {
-        gauss
-            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
-            .await
-            .unwrap();
-        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
-    }
+    let mut gauss = log_in(&mut cell, "gauss", Role::Cav).await;
+    are_denied(&cell, &mut gauss, &["ledger/gauss", "cell"], false).await;
     cell.honest_traffic_goes_on().await;
 }
 
@@ -80,14 +81,13 @@ async fn a_report_is_not_kept_for_latecomers() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
-    for (denied, topic) in (1..).zip(["detections/gauss", "vote_detections/gauss", "ledger/gauss"])
-    {
-        gauss
-            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), true)
-            .await
-            .unwrap();
-        assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
-    }
+    are_denied(
+        &cell,
+        &mut gauss,
+        &["detections/gauss", "vote_detections/gauss", "ledger/gauss"],
+        true,
+    )
+    .await;
     let will = LastWill::new(
         "ecod/v1/lot/detections/gauss",
         "stale",

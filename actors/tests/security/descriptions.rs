@@ -7,10 +7,11 @@ use ecod::wire::Role;
 use ecod_actors::messages::description_keeper::DescriptionKeeperMessage;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use ecod_testkit::until;
 use tokio::time::Instant;
 
 use crate::fixture::{DAY, GONE_WITHIN, Pki, node as name};
-use crate::nodes::{start_cell, until};
+use crate::nodes::start_cell;
 
 /// Has a node describe the cell by one place.
 fn describe(node: &NodeHandle, place: &str) {

@@ -15,44 +15,22 @@ use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::pki::{Credentials, EvidenceSigner, TlsConfig};
+use ecod_testkit::{node_config, until};
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{Client, DAY, GONE_WITHIN, Pki, SOON, client_config, node as name};
+use crate::fixture::{Client, DAY, GONE_WITHIN, Pki, client_config, node as name};
 use crate::nodes::aggregator;
 use crate::shares::inverted;
 
 fn config(node: &str, role: Role, tls: &TlsConfig, state: &Path) -> NodeConfig {
-    let ball = LandmarkConfig {
-        id: "ball".into(),
-        x_m: 1.0,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: BTreeMap::default(),
-    };
     let mut config = NodeConfig {
-        name: Some(name(node)),
-        cell: NodeName::from_static("lot"),
-        role,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
-        landmarks: vec![ball],
+        landmarks: vec![LandmarkConfig::at("ball", 1.0, 0.0)],
         tls: Some(tls.clone()),
         state_dir: Some(state.to_owned()),
-        ..NodeConfig::default()
+        ..node_config(node, "lot", role)
     };
     config.reputations.publish_period_s = 0.1;
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config
-}
-
-async fn until(what: &str, is_reached: impl Fn() -> bool) {
-    let end = Instant::now() + SOON;
-    while !is_reached() {
-        assert!(Instant::now() < end, "never: {what}");
-        sleep(Duration::from_millis(20)).await;
-    }
 }
 
 fn reputations(node: &NodeHandle) -> BTreeMap<NodeName, Reputation> {

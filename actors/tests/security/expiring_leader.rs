@@ -35,12 +35,7 @@ async fn longest_gap_until(leader: &str, node: &NodeHandle) -> Duration {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_leader_hands_over_before_its_certificate_ends_and_leads_again_with_a_new_one() {
     let mut pki = Pki::new();
-    let files = [
-        ("edge", Role::Edge),
-        ("euclid", Role::Auto),
-        ("gauss", Role::Cav),
-    ]
-    .map(|(node, role)| pki.issue(node, role, DAY));
+    let files = pki.issue_three();
     let nodes = start_cell(files).await;
     let gauss = &nodes[2];
     for (valid, leader) in [(ENDS_SOON, "euclid"), (DAY, "edge")] {

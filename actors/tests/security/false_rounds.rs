@@ -12,10 +12,11 @@ use ecod::wire::{
 use ecod_actors::node::NodeHandle;
 use ecod_actors::telemetry::counters::{Counters, Event};
 use ecod_actors::transport::pki::TlsConfig;
+use ecod_testkit::until;
 use tokio::time::{Instant, sleep};
 
 use crate::fixture::{Client, DAY, Pki, client_config, node as name};
-use crate::nodes::{start_cell, until};
+use crate::nodes::start_cell;
 
 /// Time for which false rounds come.
 const ATTACK: Duration = Duration::from_secs(3);

@@ -89,6 +89,16 @@ impl Pki {
         self.files(&self.authority, name)
     }
 
+    /// The files of an edge, a candidate and a vehicle that never leads.
+    pub(crate) fn issue_three(&mut self) -> [TlsConfig; 3] {
+        [
+            ("edge", Role::Edge),
+            ("euclid", Role::Auto),
+            ("gauss", Role::Cav),
+        ]
+        .map(|(node, role)| self.issue(node, role, DAY))
+    }
+
     /// The files in this cell of a certificate that another CA may have issued.
     pub(crate) fn files(&self, issuer: &Authority, name: &str) -> TlsConfig {
         let (certificate, key) = issuer.files_of(&node(name));

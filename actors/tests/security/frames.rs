@@ -1,79 +1,29 @@
 //! Datagrams between nodes, recorded and sent again by somebody on the way.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use ecod::wire::Role;
-use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
-use ecod_actors::platform::clock;
-use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::gossip::{
-    FrameCounters, FrameEvent, MembershipConfig, MembershipEvent,
-};
-use ractor::{Actor, ActorRef, call_t};
+use ecod_actors::transport::gossip::{FrameEvent, MembershipEvent};
+use ecod_testkit::{Member, member_config, until};
 use tokio::net::UdpSocket;
-use tokio::sync::watch;
-use tokio::time::{Instant, sleep};
+use tokio::time::sleep;
 
-use crate::fixture::{SOON, node};
+use crate::fixture::node;
 
-struct Node {
-    actor: ActorRef<MembershipMessage>,
-    address: SocketAddr,
-    payloads: Arc<Mutex<Vec<Bytes>>>,
-    counters: Arc<FrameCounters>,
-    members: watch::Receiver<Vec<ecod_actors::transport::gossip::Member>>,
+async fn start(name: &str, seed: Option<SocketAddr>) -> Member {
+    Member::start(name, member_config(seed.as_slice()), |_| ()).await
 }
 
-async fn start(name: &str, seed: Option<SocketAddr>) -> Node {
-    let mut config = MembershipConfig {
-        key: Some(Secret::new("5e".repeat(32))),
-        bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
-        seeds: seed.iter().map(ToString::to_string).collect(),
-        ..MembershipConfig::default()
-    };
-    config.multicast.enabled = false;
-    let (payloads, counters) = (
-        Arc::<Mutex<Vec<Bytes>>>::default(),
-        Arc::<FrameCounters>::default(),
-    );
-    let (sink, (sender, members)) = (Arc::clone(&payloads), watch::channel(Vec::new()));
-    let arguments = MembershipArguments {
-        name: node(name),
-        cell: node("lot"),
-        run: clock::now().micros(),
-        role: Role::Auto,
-        broker: None,
-        credentials: None,
-        config,
-        events: Arc::new(move |event| {
-            if let MembershipEvent::Received { payload, .. } = event {
-                sink.lock().unwrap().push(payload);
-            }
-        }),
-        members: sender,
-        counters: Arc::clone(&counters),
-    };
-    let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
-    let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-    Node {
-        actor,
-        address,
-        payloads,
-        counters,
-        members,
-    }
-}
-
-async fn until(what: &str, mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + SOON;
-    while !holds() {
-        assert!(Instant::now() < deadline, "{what}");
-        sleep(Duration::from_millis(10)).await;
-    }
+/// The first byte of each payload that a node has received.
+fn received_by(node: &Member) -> Vec<u8> {
+    let events = node.events.lock().unwrap();
+    let payloads = events.iter().filter_map(|event| match event {
+        MembershipEvent::Received { payload, .. } => Some(payload[0]),
+        _ => None,
+    });
+    payloads.collect()
 }
 
 /// Stands between two nodes and sends every datagram for the first three times; the second knows the first by its
@@ -121,19 +71,13 @@ async fn a_repeated_frame_is_taken_once_and_counted() {
             .unwrap();
         sleep(Duration::from_millis(5)).await;
     }
-    until("all arrive", || edge.payloads.lock().unwrap().len() >= 20).await;
+    until("all arrive", || received_by(&edge).len() >= 20).await;
     until("repetitions are counted", || {
         edge.counters.get(FrameEvent::Replayed) >= 20
     })
     .await;
     sleep(Duration::from_millis(200)).await;
-    let taken = edge
-        .payloads
-        .lock()
-        .unwrap()
-        .iter()
-        .map(|payload| payload[0])
-        .collect::<Vec<_>>();
+    let taken = received_by(&edge);
     assert_eq!(taken, (0..20).collect::<Vec<_>>(), "each once, in order");
     assert!(
         !edge.members.borrow().is_empty(),

@@ -1,89 +1,41 @@
 //! Memberships that prove certificates, on real sockets: a holder of the key alone, or a revoked node, is no member.
 
-use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::{Arc, Mutex};
+use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::wire::Role;
-use ecod_actors::actors::membership::{Membership, MembershipArguments};
-use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
-use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::gossip::{
-    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent,
-};
+use ecod_actors::transport::gossip::{FrameEvent, MembershipConfig, MembershipEvent};
 use ecod_actors::transport::pki::{Credentials, TlsConfig};
-use ractor::{Actor, ActorRef, call_t};
-use tokio::sync::watch;
+use ecod_testkit::{Member, member_config, until};
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{DAY, GONE_WITHIN, Pki, SOON, node};
+use crate::fixture::{DAY, GONE_WITHIN, Pki, node};
 
-struct Node {
-    actor: ActorRef<MembershipMessage>,
-    address: SocketAddr,
-    events: Arc<Mutex<Vec<MembershipEvent>>>,
-    counters: Arc<FrameCounters>,
-    members: watch::Receiver<Vec<Member>>,
+/// Starts a membership that declares to be an edge.
+async fn start(name: &str, files: Option<&TlsConfig>, seed: Option<SocketAddr>) -> Member {
+    let config = MembershipConfig {
+        // Patient, as the machine that runs this may be busy.
+        probe_ms: 200,
+        reply_ms: 80,
+        suspect_ms: 600,
+        ..member_config(seed.as_slice())
+    };
+    Member::start(name, config, |arguments| {
+        arguments.role = Role::Edge;
+        arguments.credentials =
+            files.map(|files| Arc::new(Credentials::load(files, &node(name)).unwrap()));
+    })
+    .await
 }
 
-impl Node {
-    async fn start(name: &str, files: Option<&TlsConfig>, seed: Option<SocketAddr>) -> Self {
-        let mut config = MembershipConfig {
-            key: Some(Secret::new("5e".repeat(32))),
-            bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
-            seeds: seed.iter().map(ToString::to_string).collect(),
-            // Patient, as the machine that runs this may be busy.
-            probe_ms: 200,
-            reply_ms: 80,
-            suspect_ms: 600,
-            ..MembershipConfig::default()
-        };
-        config.multicast.enabled = false;
-        let (events, counters) = (
-            Arc::<Mutex<Vec<_>>>::default(),
-            Arc::<FrameCounters>::default(),
-        );
-        let (sink, (sender, members)) = (Arc::clone(&events), watch::channel(Vec::new()));
-        let arguments = MembershipArguments {
-            name: node(name),
-            cell: node("lot"),
-            run: clock::now().micros(),
-            role: Role::Edge,
-            broker: None,
-            credentials: files
-                .map(|files| Arc::new(Credentials::load(files, &node(name)).unwrap())),
-            config,
-            events: Arc::new(move |event| sink.lock().unwrap().push(event)),
-            members: sender,
-            counters: Arc::clone(&counters),
-        };
-        let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
-        let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-        Self {
-            actor,
-            address,
-            events,
-            counters,
-            members,
-        }
-    }
-
-    fn sees(&self) -> Vec<(String, Role)> {
-        self.members
-            .borrow()
-            .iter()
-            .map(|member| (member.name.to_string(), member.role))
-            .collect()
-    }
-}
-
-async fn until(what: &str, mut holds: impl FnMut() -> bool) {
-    let deadline = Instant::now() + SOON;
-    while !holds() {
-        assert!(Instant::now() < deadline, "{what}");
-        sleep(Duration::from_millis(10)).await;
-    }
+fn seen_by(node: &Member) -> Vec<(String, Role)> {
+    node.members
+        .borrow()
+        .iter()
+        .map(|member| (member.name.to_string(), member.role))
+        .collect()
 }
 
 /// All declare to be an edge; what others see is what their certificates allow.
@@ -94,8 +46,8 @@ async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_no
         pki.issue("edge", Role::Edge, DAY),
         pki.issue("euclid", Role::Auto, DAY),
     ];
-    let edge = Node::start("edge", Some(&edge), None).await;
-    let bare = Node::start("gauss", None, Some(edge.address)).await;
+    let edge = start("edge", Some(&edge), None).await;
+    let bare = start("gauss", None, Some(edge.address)).await;
     let mut elsewhere = Pki::new();
     let strange = TlsConfig {
         ca: pki.authority.ca(),
@@ -105,10 +57,10 @@ async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_no
         revocation_list: None,
         ..strange
     };
-    let strange = Node::start("zeno", Some(&strange), Some(edge.address)).await;
-    let euclid = Node::start("euclid", Some(&euclid), Some(edge.address)).await;
+    let strange = start("zeno", Some(&strange), Some(edge.address)).await;
+    let euclid = start("euclid", Some(&euclid), Some(edge.address)).await;
     until("they meet", || {
-        edge.sees().len() == 1 && euclid.sees().len() == 1
+        seen_by(&edge).len() == 1 && seen_by(&euclid).len() == 1
     })
     .await;
     until("the others are counted", || {
@@ -117,12 +69,12 @@ async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_no
     })
     .await;
     assert_eq!(
-        edge.sees(),
+        seen_by(&edge),
         [("euclid".to_owned(), Role::Auto)],
         "as its certificate says"
     );
-    assert_eq!(euclid.sees(), [("edge".to_owned(), Role::Edge)]);
-    assert!(bare.sees().is_empty() && strange.sees().is_empty());
+    assert_eq!(seen_by(&euclid), [("edge".to_owned(), Role::Edge)]);
+    assert!(seen_by(&bare).is_empty() && seen_by(&strange).is_empty());
     for node in [edge, bare, strange, euclid] {
         node.actor.stop(None);
     }
@@ -135,10 +87,10 @@ async fn a_revoked_node_is_down_soon_after_the_list_is_written() {
         pki.issue("edge", Role::Edge, DAY),
         pki.issue("euclid", Role::Auto, DAY),
     ];
-    let edge = Node::start("edge", Some(&edge), None).await;
-    let euclid = Node::start("euclid", Some(&euclid), Some(edge.address)).await;
+    let edge = start("edge", Some(&edge), None).await;
+    let euclid = start("euclid", Some(&euclid), Some(edge.address)).await;
     until("they meet", || {
-        edge.sees().len() == 1 && euclid.sees().len() == 1
+        seen_by(&edge).len() == 1 && seen_by(&euclid).len() == 1
     })
     .await;
     pki.authority.revoke(&node("euclid"), clock::now()).unwrap();
@@ -157,7 +109,7 @@ async fn a_revoked_node_is_down_soon_after_the_list_is_written() {
     assert!(written.elapsed() < GONE_WITHIN, "{:?}", written.elapsed());
     assert_eq!(edge.counters.get(FrameEvent::Expelled), 1);
     sleep(Duration::from_secs(2)).await;
-    assert!(edge.sees().is_empty(), "it does not come back");
+    assert!(seen_by(&edge).is_empty(), "it does not come back");
     edge.actor.stop(None);
     euclid.actor.stop(None);
 }

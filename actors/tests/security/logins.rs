@@ -8,10 +8,11 @@ use std::time::Duration;
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::transport::pki::TlsConfig;
+use ecod_testkit::until;
 use tokio::time::{Instant, sleep};
 
 use crate::fixture::{Client, DAY, Pki, SOON, client_config};
-use crate::nodes::{aggregator, start, start_cell, start_with, until};
+use crate::nodes::{aggregator, start, start_cell, start_with};
 
 /// An edge whose broker has room for its own node only.
 async fn full_edge(pki: &mut Pki) -> NodeHandle {
@@ -81,12 +82,7 @@ impl Write for Log {
 async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next()
  {
     let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
-    let files = [
-        ("edge", Role::Edge),
-        ("euclid", Role::Auto),
-        ("gauss", Role::Cav),
-    ]
-    .map(|(node, role)| pki.issue(node, role, DAY));
+    let files = pki.issue_three();
     let foreign = elsewhere.issue("edge", Role::Edge, DAY);
     let tls = client_config("gauss", &files[2]);
     // The edge alone trusts the other CA.
@@ -138,12 +134,7 @@ async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_an
 #[tokio::test]
 async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_nothing() {
     let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
-    let files = [
-        ("edge", Role::Edge),
-        ("euclid", Role::Auto),
-        ("gauss", Role::Cav),
-    ]
-    .map(|(node, role)| pki.issue(node, role, DAY));
+    let files = pki.issue_three();
     let [edge, euclid, gauss] = start_cell(files).await;
     edge.stop().await;
     until("euclid leads", || {

@@ -1,16 +1,13 @@
 //! Whole nodes of a cell with certificates, in this process.
 
 use std::net::SocketAddr;
-use std::time::Duration;
 
 use ecod::leadership::Position;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::transport::pki::TlsConfig;
-use tokio::time::{Instant, sleep};
-
-use crate::fixture::{SOON, node as name};
+use ecod_testkit::{node_config, until};
 
 /// Starts a node that greets another one.
 pub(crate) async fn start(
@@ -31,17 +28,10 @@ pub(crate) async fn start_with(
     adjust: impl FnOnce(&mut NodeConfig),
 ) -> NodeHandle {
     let mut config = NodeConfig {
-        name: Some(name(node)),
-        cell: name("lot"),
-        role,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
         tls: Some(tls),
-        ..NodeConfig::default()
+        ..node_config(node, "lot", role)
     };
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
     config.membership.seeds = seed.iter().map(ToString::to_string).collect();
-    config.dashboard.enabled = false;
     adjust(&mut config);
     node::start(config).await.unwrap()
 }
@@ -68,14 +58,4 @@ pub(crate) fn aggregator(node: &NodeHandle) -> Option<String> {
         .borrow()
         .as_ref()
         .map(|newest| newest.map.aggregator.to_string())
-}
-
-/// Waits for something; the time that it took.
-pub(crate) async fn until(what: &str, is_reached: impl Fn() -> bool) -> Duration {
-    let start = Instant::now();
-    while !is_reached() {
-        assert!(start.elapsed() < SOON, "never: {what}");
-        sleep(Duration::from_millis(5)).await;
-    }
-    start.elapsed()
 }

@@ -9,33 +9,21 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::secret::Secret;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
+use ecod_testkit::node_config;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::time::{Instant, sleep, timeout};
 
-use crate::fixture::{SOON, node as name};
+use crate::fixture::SOON;
 
 fn config(node: &str, role: Role, broker: SocketAddr, gossip: Option<SocketAddr>) -> NodeConfig {
-    let landmark = LandmarkConfig {
-        id: "slot-0".into(),
-        x_m: 0.0,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
     let mut config = NodeConfig {
-        name: Some(name(node)),
-        cell: name("lot"),
-        role,
-        landmarks: vec![landmark],
-        ..NodeConfig::default()
+        listen: None,
+        landmarks: vec![LandmarkConfig::at("slot-0", 0.0, 0.0)],
+        ..node_config(node, "lot", role)
     };
     config.mqtt.broker = Some(broker.into());
     config.mqtt.sign = true;
     config.membership.key = Some(Secret::new("5e".repeat(32)));
-    config.membership.bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config.membership.seeds = gossip.iter().map(ToString::to_string).collect();
     config.validate().unwrap();
     config

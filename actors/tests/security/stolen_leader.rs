@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use ecod_testkit::until;
 use tokio::time::{Instant, sleep};
 
-use crate::fixture::{DAY, GONE_WITHIN, Pki, node as name};
-use crate::nodes::{aggregator, start_cell, until};
+use crate::fixture::{GONE_WITHIN, Pki, node as name};
+use crate::nodes::{aggregator, start_cell};
 
 /// Time in which nodes go on without the leader, from when the first of them has read the list.
 const REPLACED_WITHIN: Duration = Duration::from_secs(1);
@@ -16,12 +16,7 @@ const REPLACED_WITHIN: Duration = Duration::from_secs(1);
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_come_back() {
     let mut pki = Pki::new();
-    let [mut edge_files, euclid_files, gauss_files] = [
-        ("edge", Role::Edge),
-        ("euclid", Role::Auto),
-        ("gauss", Role::Cav),
-    ]
-    .map(|(node, role)| pki.issue(node, role, DAY));
+    let [mut edge_files, euclid_files, gauss_files] = pki.issue_three();
     let own_list = tempfile::NamedTempFile::new().unwrap();
     std::fs::copy(pki.authority.revocation_list(), own_list.path()).unwrap();
     edge_files.revocation_list = Some(own_list.path().into());

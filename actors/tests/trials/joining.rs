@@ -4,23 +4,19 @@ mod machines;
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Write};
-use std::net::UdpSocket;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod_testkit::{command, free_gossip_address};
+
 /// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn ecod_node(arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in
-        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
-    {
-        command.env_remove(key);
-    }
-    command.args(arguments).stdin(Stdio::null());
+    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
+    command.args(arguments);
     command
 }
 
@@ -94,6 +90,12 @@ fn invite(directory: &str, seed: &str, names: &[&str]) -> (Running, Vec<String>)
             .spawn()
             .unwrap(),
     );
+    let tokens = tokens(&mut host, names.len());
+    (host, tokens)
+}
+
+/// The tokens in the commands that an inviting node prints.
+pub(crate) fn tokens(host: &mut Running, count: usize) -> Vec<String> {
     let lines = BufReader::new(host.0.stdout.take().unwrap()).lines();
     let tokens = lines.filter_map(|line| {
         Some(
@@ -103,8 +105,7 @@ fn invite(directory: &str, seed: &str, names: &[&str]) -> (Running, Vec<String>)
                 .to_owned(),
         )
     });
-    let tokens: Vec<_> = tokens.take(names.len()).collect();
-    (host, tokens)
+    tokens.take(count).collect()
 }
 
 pub(crate) fn until(what: &str, holds: impl Fn() -> bool) {
@@ -121,11 +122,7 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
     let [edge, gauss, euclid] = machines
         .each_ref()
         .map(|machine| machine.path().to_str().unwrap());
-    let gossip = UdpSocket::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap()
-        .to_string();
+    let gossip = free_gossip_address().to_string();
 
     let said = succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
     assert!(
@@ -207,11 +204,7 @@ fn a_node_that_joins_a_cell_of_a_city_takes_the_citys_vehicles() {
     let [city, edge, gauss] = machines
         .each_ref()
         .map(|machine| machine.path().to_str().unwrap());
-    let gossip = UdpSocket::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap()
-        .to_string();
+    let gossip = free_gossip_address().to_string();
     succeeds(&["pki", "city", "init", "--city", "town", "--dir", city]);
     succeeds(&["pki", "city", "issue", "euclid", "--dir", city]);
     succeeds(&[

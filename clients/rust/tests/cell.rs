@@ -20,37 +20,21 @@ use ecod_client::{
     Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, NodeName, NodeState,
     PerceivedObject, Role, Settings, Timestamp, Tls,
 };
+use ecod_testkit::{loopback, node_config, tls_files};
 use rumqttc::{Client, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
 /// Maximum time for any step on a busy machine.
 const SOON: Duration = Duration::from_secs(30);
 
-fn loopback() -> SocketAddr {
-    SocketAddr::from(([127, 0, 0, 1], 0))
-}
-
-fn config(name: &'static str, role: Role) -> NodeConfig {
-    let landmark = |id: &str, x_m| LandmarkConfig {
-        id: id.into(),
-        x_m,
-        y_m: 0.0,
-        facing_deg: None,
-        vacancy: None,
-        synonyms: Default::default(),
-    };
-    let mut config = NodeConfig {
-        name: Some(NodeName::from_static(name)),
-        cell: NodeName::from_static("lot-1"),
-        role,
-        listen: Some(loopback()),
-        landmarks: vec![landmark("slot-0", 0.0), landmark("slot-1", 2.5)],
-        ..NodeConfig::default()
-    };
-    config.membership.bind = Some(loopback());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
-    config
+fn config(name: &str, role: Role) -> NodeConfig {
+    NodeConfig {
+        landmarks: vec![
+            LandmarkConfig::at("slot-0", 0.0, 0.0),
+            LandmarkConfig::at("slot-1", 2.5, 0.0),
+        ],
+        ..node_config(name, "lot-1", role)
+    }
 }
 
 /// A running node and its local broker.
@@ -167,18 +151,12 @@ fn tls_of(authority: &mut Authority, name: &'static str, role: Role) -> (TlsConf
     authority
         .issue(&name, role, Duration::from_secs(86_400), clock::now())
         .unwrap();
-    let (certificate, key) = authority.files_of(&name);
-    let tls = Tls::of_door(authority.ca(), &certificate, &key);
-    (
-        TlsConfig {
-            ca: authority.ca(),
-            certificate,
-            key,
-            revocation_list: None,
-            city: None,
-        },
-        tls,
-    )
+    let files = TlsConfig {
+        revocation_list: None,
+        ..tls_files(authority, &name)
+    };
+    let tls = Tls::of_door(files.ca.clone(), &files.certificate, &files.key);
+    (files, tls)
 }
 
 #[test]

@@ -17,6 +17,7 @@ use ecod_client::{
 };
 use ecod_interop::bridge::{CpmBridge, CpmRefusal};
 use ecod_interop::cpm::{self, CpmCell, CpmError, ReceivedCpm, StationIds};
+use ecod_testkit::{node_config, tls_files};
 use rumqttc::{Client, Event, Incoming, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
@@ -39,19 +40,11 @@ struct Edge {
 
 impl Edge {
     fn start(tls: Option<(TlsConfig, Tls)>) -> Self {
-        let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
         let (server, client) = tls.unzip();
-        let mut config = NodeConfig {
-            name: Some(NodeName::from_static("edge")),
-            cell: NodeName::from_static("lot-1"),
-            role: Role::Edge,
-            listen: Some(loopback),
+        let config = NodeConfig {
             tls: server,
-            ..NodeConfig::default()
+            ..node_config("edge", "lot-1", Role::Edge)
         };
-        config.membership.bind = Some(loopback);
-        config.membership.multicast.enabled = false;
-        config.dashboard.enabled = false;
         config.validate().unwrap();
         let runtime = Runtime::new().unwrap();
         let handle = runtime.block_on(node::start(config)).unwrap();
@@ -390,18 +383,9 @@ fn with_certificates_a_program_of_the_node_publishes_cpms() {
     authority
         .issue(&name, Role::Edge, Duration::from_secs(86_400), time)
         .unwrap();
-    let (certificate, key) = authority.files_of(&name);
-    let client = Tls::of_door(authority.ca(), &certificate, &key);
-    let edge = Edge::start(Some((
-        TlsConfig {
-            ca: authority.ca(),
-            certificate,
-            key,
-            revocation_list: None,
-            city: None,
-        },
-        client,
-    )));
+    let files = tls_files(&authority, &name);
+    let client = Tls::of_door(files.ca.clone(), &files.certificate, &files.key);
+    let edge = Edge::start(Some((files, client)));
     let (sender, reader) = (
         Cell::connect(edge.settings.clone()),
         Cell::connect(edge.settings.clone()),

@@ -1,6 +1,5 @@
 //! Live topics of ROS 2: a cell's messages, taken by Cyclone DDS for Python, and its detections, reported to a real node.
 
-use std::net::SocketAddr;
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -10,26 +9,16 @@ use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;
 use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
 use ecod_actors::node;
-use ecod_actors::node::config::NodeConfig;
-use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePose};
+use ecod_client::{Cell, Frame, PerceivedObject, Role, Settings, WirePose};
 use ecod_interop::dds::{DetectorTopics, RosBridge, RosBridgeError, RosCamera, RosSettings};
+use ecod_testkit::node_config;
 use tokio::runtime::Runtime;
 
 /// Runs a bridge beside an edge to which a vehicle reports. It ends once Python has published such detections, and found an
 /// object of this label at this place of the map.
 fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
     let python = std::env::var("DDS_PYTHON").unwrap();
-    let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
-    let mut config = NodeConfig {
-        name: Some(NodeName::from_static("edge")),
-        cell: NodeName::from_static("lot-1"),
-        role: Role::Edge,
-        listen: Some(loopback),
-        ..NodeConfig::default()
-    };
-    config.membership.bind = Some(loopback);
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
+    let config = node_config("edge", "lot-1", Role::Edge);
     let runtime = Runtime::new().unwrap();
     let handle = runtime.block_on(node::start(config)).unwrap();
     let broker = handle.listens_at().unwrap().to_string();

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::io::{Cursor, Seek, Write};
-use std::net::SocketAddr;
 use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -10,8 +9,9 @@ use std::time::{Duration, Instant};
 use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::recorder::{RecordConfig, files};
-use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePose};
+use ecod_client::{Cell, Frame, PerceivedObject, Role, Settings, WirePose};
 use ecod_interop::ros2::{Conversion, ConversionError, RosLog};
+use ecod_testkit::{node_config, output_of};
 use tokio::runtime::Runtime;
 
 /// Writes a log as MCAP of profile `ros2`.
@@ -23,21 +23,13 @@ fn convert(log: &[u8], output: impl Write + Seek) -> Result<Conversion, Conversi
 
 /// Has a vehicle report a car to an edge until the map has it for a second; gives the edge's log.
 fn log(directory: &Path) -> Vec<u8> {
-    let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
-    let mut config = NodeConfig {
-        name: Some(NodeName::from_static("edge")),
-        cell: NodeName::from_static("lot-1"),
-        role: Role::Edge,
-        listen: Some(loopback),
+    let config = NodeConfig {
         record: Some(RecordConfig {
             dir: directory.to_owned(),
             ..RecordConfig::default()
         }),
-        ..NodeConfig::default()
+        ..node_config("edge", "lot-1", Role::Edge)
     };
-    config.membership.bind = Some(loopback);
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     let runtime = Runtime::new().unwrap();
     let handle = runtime.block_on(node::start(config)).unwrap();
     let (broker, cell) = (handle.listens_at().unwrap().to_string(), "lot-1".into());
@@ -263,15 +255,6 @@ fn readers_of_ros_read_it_and_write_the_same_bytes() {
         convert(log, std::fs::File::create(output).unwrap()).unwrap();
     }
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/check-ros2.py");
-    let run = Command::new(python)
-        .arg(script)
-        .args(&outputs)
-        .output()
-        .unwrap();
-    assert!(
-        run.status.success(),
-        "{}",
-        String::from_utf8_lossy(&run.stderr)
-    );
-    print!("{}", String::from_utf8_lossy(&run.stdout));
+    let mut reader = Command::new(python);
+    print!("{}", output_of(reader.arg(script).args(&outputs)));
 }

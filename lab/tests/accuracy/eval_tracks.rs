@@ -1,16 +1,17 @@
 //! Figures of tracks against those of published implementations on the same output.
 //!
-//! `tests/eval_tracks/expected.json` was written by TrackEval 1.3.0 and motmetrics 1.4.0:
-//! `RECORD=tests/eval_tracks/expected.json packaging/check-eval-tracks`. Truth and maps are late fusion of the first two
-//! seconds of generated traffic: `eval_tracks --seeds tuning --count 1 --observers 4 --seconds 2 --recordings DIR`.
+//! `eval_tracks/expected.json` was written by TrackEval 1.3.0 and motmetrics 1.4.0:
+//! `RECORD=lab/tests/accuracy/eval_tracks/expected.json packaging/check-eval-tracks`. Truth and maps are late fusion of the
+//! first two seconds of generated traffic:
+//! `eval_tracks --seeds tuning --count 1 --observers 4 --seconds 2 --recordings DIR`.
 
 use ecod::wire::GlobalMap;
 use ecod_lab::eval::tracks::{TrackEvaluation, TrackTruth};
 use serde_json::Value;
 
-const TRUTH: &str = include_str!("../eval_tracks/truth.json");
-const MAPS: &str = include_str!("../eval_tracks/maps.jsonl");
-const EXPECTED: &str = include_str!("../eval_tracks/expected.json");
+const TRUTH: &str = include_str!("eval_tracks/truth.json");
+const MAPS: &str = include_str!("eval_tracks/maps.jsonl");
+const EXPECTED: &str = include_str!("eval_tracks/expected.json");
 
 /// Compares all numbers of `expected` with those of the same name, and says how many there are.
 fn compare(path: &str, found: &Value, expected: &Value) -> usize {

@@ -20,6 +20,28 @@ fn ecod_lab(arguments: &[&str]) -> Output {
         .unwrap()
 }
 
+/// `ecod-lab eval` of what a cell has published, with further flags.
+fn eval(flags: &[&str], truth: &Path, input: &Path, out: &Path) -> Output {
+    let files = [
+        "--truth",
+        text(truth),
+        "--input",
+        text(input),
+        "--out",
+        text(out),
+    ];
+    ecod_lab(&[&["eval"], flags, &files].concat())
+}
+
+#[track_caller]
+fn succeeded(output: &Output) {
+    assert!(output.status.success(), "{}", said_by(output));
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
 fn said_by(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
@@ -41,18 +63,22 @@ fn replay(config: ReplayConfig, reports: &Path) -> (Vec<FusedLine>, Summary) {
     (output, summary)
 }
 
+fn write_lines(path: &Path, fused: &[FusedLine]) {
+    let lines: Vec<_> = fused
+        .iter()
+        .map(|line| serde_json::to_string(line).unwrap())
+        .collect();
+    fs::write(path, lines.join("\n")).unwrap();
+}
+
 /// Replays the example and returns the output.
 fn replay_lot(folder: &TempDir) -> PathBuf {
     let (fused, _) = replay(
         cell(Some(&example("recordings/lot.toml"))).unwrap(),
         &example("recordings/lot.jsonl"),
     );
-    let lines: Vec<_> = fused
-        .iter()
-        .map(|line| serde_json::to_string(line).unwrap())
-        .collect();
     let output = folder.path().join("out.jsonl");
-    fs::write(&output, lines.join("\n")).unwrap();
+    write_lines(&output, &fused);
     output
 }
 
@@ -66,20 +92,13 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
         example("recordings/lot.toml"),
     );
     let result = folder.path().join("result.json");
-    let run = ecod_lab(&[
-        "eval",
-        "--truth",
-        text(&truth),
-        "--input",
-        text(&output),
-        "--reports",
-        text(&reports),
-        "--config",
-        text(&config),
-        "--out",
-        text(&result),
-    ]);
-    assert!(run.status.success(), "{}", said_by(&run));
+    let run = eval(
+        &["--reports", text(&reports), "--config", text(&config)],
+        &truth,
+        &output,
+        &result,
+    );
+    succeeded(&run);
     let table = String::from_utf8(run.stdout).unwrap();
     assert!(
         ["PACE", "VOTE", "majority %", "euclid", "truth", "recall %"]
@@ -87,7 +106,7 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
             .all(|part| table.contains(part)),
         "{table}"
     );
-    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    let result = json(&result);
     for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
         let scores = &result[algorithm];
         assert_eq!(scores["items"].as_u64(), Some(8));
@@ -109,23 +128,19 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
 fn objects_that_move_are_judged_by_where_they_were() {
     let folder = TempDir::new().unwrap();
     let recorded = |name: &str| {
-        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name)
+        Path::new(concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/tests/accuracy/eval_tracks"
+        ))
+        .join(name)
     };
     let (truth, maps, result) = (
         recorded("truth.json"),
         recorded("maps.jsonl"),
         folder.path().join("result.json"),
     );
-    let run = ecod_lab(&[
-        "eval",
-        "--truth",
-        text(&truth),
-        "--input",
-        text(&maps),
-        "--out",
-        text(&result),
-    ]);
-    assert!(run.status.success(), "{}", said_by(&run));
+    let run = eval(&[], &truth, &maps, &result);
+    succeeded(&run);
     let table = String::from_utf8(run.stdout).unwrap();
     assert!(
         [
@@ -142,7 +157,7 @@ fn objects_that_move_are_judged_by_where_they_were() {
         .all(|p| table.contains(p)),
         "{table}"
     );
-    let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+    let result = json(&result);
     let ap_pct = result["tracks"]["ap_pct"].as_array().unwrap();
     assert!(
         ap_pct.len() == 4
@@ -193,19 +208,9 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
         (&truth, &said),
         (&folder.path().join("truth"), &folder.path().join("said")),
     ] {
-        let run = ecod_lab(&[
-            "eval",
-            "--format",
-            "kitti",
-            "--truth",
-            text(truth),
-            "--input",
-            text(input),
-            "--out",
-            text(&result),
-        ]);
-        assert!(run.status.success(), "{}", said_by(&run));
-        let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+        let run = eval(&["--format", "kitti"], truth, input, &result);
+        succeeded(&run);
+        let result = json(&result);
         let (tracks, at) = (&result["tracks"], &result["tracks"]["at_default"]);
         assert_eq!(
             (tracks["frames"].as_u64(), tracks["objects"].as_u64()),
@@ -224,20 +229,7 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
     let detections: String = (0..4)
         .map(|n| format!("{n},2,0,0,9,9,8.5,1.5,1.6,3.9,-8.0,1.7,30.0,0,0\n"))
         .collect();
-    let run = |input: &Path| {
-        let flags = [
-            "eval",
-            "--format",
-            "kitti",
-            "--truth",
-            text(&truth),
-            "--input",
-            text(input),
-            "--out",
-            text(&result),
-        ];
-        ecod_lab(&flags)
-    };
+    let run = |input: &Path| eval(&["--format", "kitti"], &truth, input, &result);
     assert!(run(&write("detections.txt", detections)).status.success());
     let broken = run(&write(
         "broken.txt",
@@ -278,27 +270,16 @@ fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
         )
     };
     let run = convert(&format!("left={}", text(&left)));
-    assert!(run.status.success(), "{}", said_by(&run));
+    succeeded(&run);
     let (fused, summary) = replay(ReplayConfig::default(), &reports);
     assert_eq!((summary.lines, summary.used()), (60, 60));
-    let lines: Vec<_> = fused
-        .iter()
-        .map(|line| serde_json::to_string(line).unwrap())
-        .collect();
-    fs::write(&maps, lines.join("\n")).unwrap();
-    let flags = [
-        "eval",
-        "--format",
-        "mot",
-        "--truth",
-        text(&truth),
-        "--input",
-        text(&maps),
-        "--out",
-        text(&result),
-    ];
-    assert!(ecod_lab(&flags).status.success());
-    let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    write_lines(&maps, &fused);
+    assert!(
+        eval(&["--format", "mot"], &truth, &maps, &result)
+            .status
+            .success()
+    );
+    let result = json(&result);
     let at = &result["tracks"]["at_best_f1"];
     assert_eq!(
         (
@@ -353,33 +334,12 @@ fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these()
         text(&reports),
     ];
     let run = ecod_lab(&flags);
-    assert!(run.status.success(), "{}", said_by(&run));
-    let lines = replay(ReplayConfig::default(), &reports).0;
-    fs::write(
-        &maps,
-        lines
-            .iter()
-            .map(|line| serde_json::to_string(line).unwrap() + "\n")
-            .collect::<String>(),
-    )
-    .unwrap();
-    let judge = |truth: &Path| {
-        let flags = [
-            "eval",
-            "--format",
-            "mot",
-            "--truth",
-            text(truth),
-            "--input",
-            text(&maps),
-            "--out",
-            text(&result),
-        ];
-        ecod_lab(&flags)
-    };
+    succeeded(&run);
+    write_lines(&maps, &replay(ReplayConfig::default(), &reports).0);
+    let judge = |truth: &Path| eval(&["--format", "mot"], truth, &maps, &result);
     let run = judge(&path("truth"));
-    assert!(run.status.success(), "{}", said_by(&run));
-    let judged: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    succeeded(&run);
+    let judged = json(&result);
     assert_eq!(
         judged["tracks"]["at_best_f1"]["false_alarms"].as_u64(),
         Some(0),
@@ -428,19 +388,9 @@ fn a_truth_without_identities_judges_none() {
     );
     fs::write(&truth, "1,-1,0,0,9,9,1,3,4,0\n2,-1,0,0,9,9,1,3,4,0\n").unwrap();
     fs::write(&maps, "1,4,0,0,9,9,1,3,4,0\n2,4,0,0,9,9,1,3,5,0\n").unwrap();
-    let run = ecod_lab(&[
-        "eval",
-        "--format",
-        "mot",
-        "--truth",
-        text(&truth),
-        "--input",
-        text(&maps),
-        "--out",
-        text(&result),
-    ]);
-    assert!(run.status.success(), "{}", said_by(&run));
-    let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    let run = eval(&["--format", "mot"], &truth, &maps, &result);
+    succeeded(&run);
+    let result = json(&result);
     let at = &result["tracks"]["at_default"];
     assert_eq!(
         (at["moda_pct"].as_f64(), at["motp_m"].as_f64()),
@@ -473,8 +423,8 @@ fn the_recorded_intersection_is_judged_right() {
         "--reports",
         text(&reports),
     ]);
-    assert!(run.status.success(), "{}", said_by(&run));
-    let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
+    succeeded(&run);
+    let result = json(&out);
     let recording = &result["scenes"][0];
     assert_eq!(
         (
@@ -515,8 +465,8 @@ fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_interse
             "--out",
             text(&out),
         ]);
-        assert!(run.status.success(), "{}", said_by(&run));
-        let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
+        succeeded(&run);
+        let result = json(&out);
         assert_eq!(
             result["scenes"][0]["vote_accuracy_pct"].as_f64(),
             Some(100.0),

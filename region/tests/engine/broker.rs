@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use ecod::leadership::BrokerAddress;
 use ecod_region::broker::{BrokerArguments, BrokerLogin};
 use ecod_region::reader::{self, Reading, RegionState};
+use ecod_testkit::output_of;
 use tempfile::TempDir;
 
 /// A broker and its directory; ended when dropped.
@@ -204,30 +205,24 @@ impl Broker {
 
     /// The lines that `make-streams` prints.
     pub(crate) fn make_streams(&self) -> Vec<String> {
-        let output = Command::new(Path::new(DEPLOY).join("make-streams"))
-            .args([
-                "1",
-                "-h",
-                "127.0.0.1",
-                "-p",
-                &self.address.port().to_string(),
-                "--cafile",
-                "tls/ca.pem",
-            ])
-            .current_dir(self.directory())
-            .env("REGION_CONFIG", self.directory())
-            .output()
-            .unwrap();
-        assert!(
-            output.status.success(),
-            "{}",
-            String::from_utf8_lossy(&output.stderr)
-        );
-        String::from_utf8(output.stdout)
-            .unwrap()
-            .lines()
-            .map(str::to_owned)
-            .collect()
+        let port = self.address.port().to_string();
+        output_of(
+            Command::new(Path::new(DEPLOY).join("make-streams"))
+                .args([
+                    "1",
+                    "-h",
+                    "127.0.0.1",
+                    "-p",
+                    &port,
+                    "--cafile",
+                    "tls/ca.pem",
+                ])
+                .current_dir(self.directory())
+                .env("REGION_CONFIG", self.directory()),
+        )
+        .lines()
+        .map(str::to_owned)
+        .collect()
     }
 
     /// A reader of the whole region that tells of each message.
@@ -261,17 +256,12 @@ impl Drop for Broker {
 
 /// Runs `add-cell` as an operator does.
 fn add_cell(directory: &Path, flags: &[&str], (name, latitude, longitude): (&str, f64, f64)) {
-    let output = Command::new(Path::new(DEPLOY).join("add-cell"))
-        .args(flags)
-        .args([name, &latitude.to_string(), &longitude.to_string()])
-        .env("REGION_CONFIG", directory)
-        .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region"))
-        .output()
-        .unwrap();
-    assert!(
-        output.status.success(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
+    output_of(
+        Command::new(Path::new(DEPLOY).join("add-cell"))
+            .args(flags)
+            .args([name, &latitude.to_string(), &longitude.to_string()])
+            .env("REGION_CONFIG", directory)
+            .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region")),
     );
 }
 
@@ -281,18 +271,12 @@ fn account(flags: &[&str], name: &str, latitude: f64, longitude: f64) -> String 
         format!("--latitude={latitude}"),
         format!("--longitude={longitude}"),
     ];
-    let output = Command::new(env!("CARGO_BIN_EXE_ecod-region"))
-        .arg("cell-account")
-        .args(place)
-        .args(flags)
-        .output();
-    let output = output.unwrap();
-    assert!(
-        output.status.success(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
-    String::from_utf8(output.stdout).unwrap()
+    output_of(
+        Command::new(env!("CARGO_BIN_EXE_ecod-region"))
+            .arg("cell-account")
+            .args(place)
+            .args(flags),
+    )
 }
 
 /// A CA, and the certificate of a server at this machine's loopback address.

@@ -1,7 +1,7 @@
 //! Gaps between accepted rounds, around the end of a leader and around a split.
 
 use super::{SECOND, cell, check, ensure, one_best_leader, start_all};
-use crate::sim::node::Fault;
+use crate::sim::node::{Fault, Node};
 use crate::sim::world::{MS, World};
 use ecod::wire::Role;
 
@@ -40,27 +40,27 @@ pub(super) fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64>
         world.run_for(2 * SECOND);
         ensure(world.led.len() == changes + 1, "not exactly one new leader")?;
         for (_, node) in world.alive() {
-            let times: Vec<u64> = node
-                .accepted
-                .iter()
-                .map(|map| map.at)
-                .filter(|at| at + SECOND > from)
-                .collect();
-            ensure(
-                times.last().is_some_and(|at| at + SECOND > world.now),
-                "a vehicle is not served",
-            )?;
-            gap = gap.max(
-                times
-                    .windows(2)
-                    .map(|pair| pair[1] - pair[0])
-                    .max()
-                    .unwrap_or(0),
-            );
+            gap = gap.max(longest_gap(node, from, world.now)?.unwrap_or(0));
         }
         Ok(())
     });
     Some(gap)
+}
+
+/// The largest gap between two rounds that a node has accepted since a second before `from`, in µs. The node must be served
+/// until `now`.
+fn longest_gap(node: &Node, from: u64, now: u64) -> Result<Option<u64>, String> {
+    let times: Vec<u64> = node
+        .accepted
+        .iter()
+        .map(|map| map.at)
+        .filter(|at| at + SECOND > from)
+        .collect();
+    ensure(
+        times.last().is_some_and(|at| at + SECOND > now),
+        "a vehicle is not served",
+    )?;
+    Ok(times.windows(2).map(|pair| pair[1] - pair[0]).max())
 }
 
 /// The largest gap between two accepted rounds of any vehicle that a split cuts off from the leader, in µs; `None` if
@@ -85,17 +85,7 @@ pub(super) fn split_gap(seed: u64) -> Option<u64> {
         let from = world.now;
         world.run_for(2 * SECOND);
         for (_, node) in world.alive().filter(|(index, _)| away[*index]) {
-            let times: Vec<u64> = node
-                .accepted
-                .iter()
-                .map(|map| map.at)
-                .filter(|at| at + SECOND > from)
-                .collect();
-            ensure(
-                times.last().is_some_and(|at| at + SECOND > world.now),
-                "a vehicle is not served",
-            )?;
-            gap = gap.max(times.windows(2).map(|pair| pair[1] - pair[0]).max());
+            gap = gap.max(longest_gap(node, from, world.now)?);
         }
         let changes = world.led.len();
         world.plan(0, Fault::Heal);

@@ -10,9 +10,10 @@ use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
+use ecod_testkit::{PATIENCE, free_gossip_address, greet, tls_files};
 use tempfile::TempDir;
 
-use crate::failover::cell::{PATIENCE, config, free_address};
+use crate::failover::cell::config;
 use crate::failover::record::Record;
 
 /// A node as a process; killed when dropped.
@@ -56,9 +57,9 @@ fn start(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Process 
 
 /// The program as a node of this name, whose files are in the directory.
 fn command(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Command {
-    let bind = (role == Role::Edge).then_some(seed);
     let file = directory.join(format!("{name}.toml"));
-    let mut config = config(name, role, bind, seed, directory);
+    let mut config = config(name, role, directory);
+    greet(&mut config, seed, role == Role::Edge);
     config.tls = certificates(name, role, directory);
     std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
@@ -75,14 +76,7 @@ fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
     authority
         .issue(&node, role, Duration::from_secs(3600), clock::now())
         .unwrap();
-    let (certificate, key) = authority.files_of(&node);
-    Some(TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
-        revocation_list: Some(authority.revocation_list()),
-        city: None,
-    })
+    Some(tls_files(&authority, &node))
 }
 
 /// Where a cell that has certificates keeps its CA.
@@ -114,7 +108,7 @@ fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
 fn a_second_process_of_a_name_ends_and_the_leader_stays() {
     let directory = tempfile::tempdir().unwrap();
     let _logs = Logs(directory.path());
-    let seed = free_address();
+    let seed = free_gossip_address();
     let record = || Record::read(&directory.path().join("euclid.maps"));
     let until = |what: &str, holds: &dyn Fn() -> bool| {
         let deadline = Instant::now() + PATIENCE;
@@ -164,7 +158,7 @@ fn a_second_process_of_a_name_ends_and_the_leader_stays() {
 
 fn edge_is_killed(directory: &TempDir) {
     let _logs = Logs(directory.path());
-    let seed = free_address();
+    let seed = free_gossip_address();
     let vehicles = ["euclid", "gauss"];
     let record = |name: &str| Record::read(&directory.path().join(format!("{name}.maps")));
     let until = |what: &str, holds: &dyn Fn(&Record) -> bool| {

@@ -1,8 +1,8 @@
 //! Real nodes, each on a runtime of its own, and plain MQTT clients at their doors.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -10,39 +10,31 @@ use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{Encoding, GlobalMap, ObjectReport, PerceivedObject, Role, decode, encode};
+use ecod_actors::node::NodeHandle;
 use ecod_actors::node::config::NodeConfig;
-use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
-use ecod_actors::transport::pki::{Authority, BrokerTrust, Credentials, TlsConfig};
+use ecod_actors::transport::pki::{Authority, BrokerTrust, Credentials};
+use ecod_testkit::{loopback, node_config, tls_files};
 use rumqttc::v5::mqttbytes::QoS;
 use rumqttc::v5::mqttbytes::v5::Packet;
 use rumqttc::v5::{AsyncClient, Event, MqttOptions};
 use rumqttc::{TlsConfiguration, Transport};
-use tempfile::TempDir;
-use tokio::runtime::{Builder, Runtime};
 use tokio::task::JoinHandle;
-use tracing_subscriber::EnvFilter;
 use uuid::Uuid;
 
 /// Maximum time for anything.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 pub(crate) struct Cell {
-    nodes: BTreeMap<String, (NodeHandle, Runtime)>,
-    /// Of the map logs, and of the certificates.
-    directory: TempDir,
+    /// Their directory also has the certificates.
+    nodes: ecod_testkit::Cell,
     authority: Option<Authority>,
 }
 
 impl Cell {
     pub(crate) fn new() -> Self {
-        tracing_subscriber::fmt()
-            .with_env_filter(EnvFilter::from_default_env())
-            .try_init()
-            .ok();
         Self {
-            nodes: BTreeMap::new(),
-            directory: tempfile::tempdir().unwrap(),
+            nodes: ecod_testkit::Cell::new(config),
             authority: None,
         }
     }
@@ -51,7 +43,7 @@ impl Cell {
     pub(crate) fn with_certificates() -> Self {
         let cell = Self::new();
         let authority = Authority::init(
-            &cell.directory.path().join("pki"),
+            &cell.nodes.directory().join("pki"),
             &NodeName::from_static("lot"),
             clock::now(),
         );
@@ -111,8 +103,8 @@ impl Cell {
         };
         let all = |cell: &Self| {
             cell.nodes
-                .values()
-                .all(|(node, _)| standby(node).as_deref() == Some(name))
+                .nodes()
+                .all(|(_, node)| standby(node).as_deref() == Some(name))
         };
         self.until(&format!("{name} is the standby"), all).await;
         tokio::time::sleep(Duration::from_millis(300)).await;
@@ -124,26 +116,13 @@ impl Cell {
         role: Role,
         adjust: impl FnOnce(&mut NodeConfig),
     ) {
-        let mut config = NodeConfig {
-            name: Some(NodeName::new(name).unwrap()),
-            cell: NodeName::from_static("lot"),
-            role,
-            listen: Some(loopback()),
-            map_log: Some(self.map_log(name)),
-            landmarks: vec![
-                LandmarkConfig::at("west", 0.0, 0.0),
-                LandmarkConfig::at("east", 3.0, 0.0),
-            ],
-            ..NodeConfig::default()
-        };
+        let mut config = self.nodes.config(name, role);
         config.membership.bind = Some(loopback());
         let seeds = self
             .nodes
-            .values()
-            .filter_map(|(node, _)| node.gossip_address());
+            .nodes()
+            .filter_map(|(_, node)| node.gossip_address());
         config.membership.seeds = seeds.map(|address| address.to_string()).collect();
-        config.membership.multicast.enabled = false;
-        config.dashboard.enabled = false;
         if let Some(authority) = &mut self.authority {
             let (node, year) = (
                 NodeName::new(name).unwrap(),
@@ -160,17 +139,11 @@ impl Cell {
                     clock::now(),
                 )
                 .unwrap();
-            config.tls = Some(files(authority, &node));
+            config.tls = Some(tls_files(authority, &node));
         }
         adjust(&mut config);
         config.validate().unwrap();
-        let runtime = Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()
-            .unwrap();
-        let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
-        self.nodes.insert(name.to_owned(), (node, runtime));
+        self.nodes.start_with(config).await;
     }
 
     /// A program at a node's door, with the node's certificate if there are any.
@@ -191,7 +164,7 @@ impl Cell {
         };
         let owner = NodeName::new(owner).unwrap();
         let id = format!("{owner}--{id}-{}", Uuid::new_v4().simple());
-        let credentials = Credentials::load(&files(authority, &owner), &owner).unwrap();
+        let credentials = Credentials::load(&tls_files(authority, &owner), &owner).unwrap();
         let tls = TlsConfiguration::Rustls(BrokerTrust::of_door(&credentials).client());
         let mut options = MqttOptions::new(id, door.ip().to_string(), door.port());
         options.set_transport(Transport::tls_with_config(tls));
@@ -199,7 +172,7 @@ impl Cell {
     }
 
     fn map_log(&self, name: &str) -> PathBuf {
-        self.directory.path().join(format!("{name}.maps"))
+        self.nodes.directory().join(format!("{name}.maps"))
     }
 
     /// The maps that a node has accepted, by its log.
@@ -245,24 +218,19 @@ impl Cell {
 
     /// Ends all tasks of a node where they are; its sockets close.
     pub(crate) fn kill(&mut self, name: &str) {
-        let (node, runtime) = self.nodes.remove(name).unwrap();
-        runtime.shutdown_background();
-        drop(node);
+        self.nodes.kill(name);
     }
 
-    pub(crate) async fn stop(mut self) {
-        while let Some((_, (node, runtime))) = self.nodes.pop_first() {
-            runtime.spawn(node.stop()).await.unwrap();
-            runtime.shutdown_background();
-        }
+    pub(crate) async fn stop(self) {
+        self.nodes.stop().await;
     }
 
     pub(crate) fn node(&self, name: &str) -> &NodeHandle {
-        &self.nodes[name].0
+        self.nodes.node(name)
     }
 
     pub(crate) fn names(&self) -> Vec<String> {
-        self.nodes.keys().cloned().collect()
+        self.nodes.names()
     }
 
     pub(crate) fn door(&self, name: &str) -> SocketAddr {
@@ -271,13 +239,13 @@ impl Cell {
 
     /// Whose map each node took last.
     pub(crate) fn sources(&self) -> Vec<Option<String>> {
-        let source = |(node, _): &(NodeHandle, Runtime)| {
+        let source = |(_, node): (&str, &NodeHandle)| {
             node.newest_map()
                 .borrow()
                 .as_ref()
                 .map(|received| received.map.aggregator.to_string())
         };
-        self.nodes.values().map(source).collect()
+        self.nodes.nodes().map(source).collect()
     }
 
     pub(crate) async fn until(&self, what: &str, holds: impl Fn(&Self) -> bool) {
@@ -316,19 +284,16 @@ impl Cell {
     }
 }
 
-fn files(authority: &Authority, node: &NodeName) -> TlsConfig {
-    let (certificate, key) = authority.files_of(node);
-    TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
-        revocation_list: Some(authority.revocation_list()),
-        city: None,
+/// A node with its map log in the directory.
+fn config(name: &str, role: Role, directory: &Path) -> NodeConfig {
+    NodeConfig {
+        map_log: Some(directory.join(format!("{name}.maps"))),
+        landmarks: vec![
+            LandmarkConfig::at("west", 0.0, 0.0),
+            LandmarkConfig::at("east", 3.0, 0.0),
+        ],
+        ..node_config(name, "lot", role)
     }
-}
-
-fn loopback() -> SocketAddr {
-    SocketAddr::from(([127, 0, 0, 1], 0))
 }
 
 /// Epoch, aggregator and round.

@@ -68,6 +68,12 @@ impl Node {
         node
     }
 
+    /// A vehicle with the settings of a node that nobody configured.
+    pub(crate) async fn follower(node: &str, broker: &BrokerAddress) -> Self {
+        let role = SubscriptionRole::Follower;
+        Self::join(node, role, MqttConfig::default(), &[broker]).await
+    }
+
     pub(crate) async fn start(node: &str, role: SubscriptionRole, mqtt: MqttConfig) -> Self {
         let (sender, deliveries) = mpsc::unbounded_channel();
         let counters = Arc::new(Counters::default());
@@ -167,6 +173,13 @@ impl Node {
         self.gateway.stop(None);
         self.handle.await.unwrap();
     }
+}
+
+/// The node `edge`, which may lead, and the vehicle `euclid` at one broker.
+pub(crate) async fn edge_and_vehicle(broker: &BrokerAddress, mqtt: MqttConfig) -> (Node, Node) {
+    let edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[broker]).await;
+    let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[broker]).await;
+    (edge, euclid)
 }
 
 /// Waits until `reached` without a fixed sleep.

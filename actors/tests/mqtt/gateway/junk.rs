@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use ecod::wire::{Encoding, RejectReason, encode};
 use ecod_actors::messages::gateway::GatewayMessage;
-use ecod_actors::transport::mqtt::{LinkState, MqttConfig, MqttVersion, SubscriptionRole};
+use ecod_actors::transport::mqtt::{LinkState, MqttConfig, MqttVersion};
 
-use crate::gateway::cell::{Node, Stranger, embedded, name, report, topic, until};
+use crate::gateway::cell::{Stranger, edge_and_vehicle, embedded, name, report, topic, until};
 use crate::mosquitto::Mosquitto;
 
 fn objects(count: usize) -> String {
@@ -112,14 +112,7 @@ async fn each_kind_of_junk_has_its_counter_and_good_reports_go_on() {
             version,
             ..MqttConfig::default()
         };
-        let mut edge = Node::join(
-            "edge",
-            SubscriptionRole::Candidate,
-            mqtt.clone(),
-            &[&address],
-        )
-        .await;
-        let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
+        let (mut edge, euclid) = edge_and_vehicle(&address, mqtt).await;
         edge.next_state_of("euclid").await;
         let mut mallory = Stranger::connect(&address).await;
         let mut expected = BTreeMap::new();
@@ -146,20 +139,7 @@ async fn each_kind_of_junk_has_its_counter_and_good_reports_go_on() {
 #[tokio::test]
 async fn the_embedded_broker_cuts_off_who_sends_a_million_objects() {
     let (_broker, address) = embedded();
-    let mut edge = Node::join(
-        "edge",
-        SubscriptionRole::Candidate,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
-    let euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let (mut edge, euclid) = edge_and_vehicle(&address, MqttConfig::default()).await;
     edge.next_state_of("euclid").await;
     let mut mallory = Stranger::connect(&address).await;
     assert!(
@@ -175,20 +155,7 @@ async fn the_embedded_broker_cuts_off_who_sends_a_million_objects() {
 async fn a_million_objects_through_a_foreign_broker_cost_at_most_a_new_connection() {
     let broker = Mosquitto::start();
     let address = broker.address();
-    let mut edge = Node::join(
-        "edge",
-        SubscriptionRole::Candidate,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
-    let euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let (mut edge, euclid) = edge_and_vehicle(&address, MqttConfig::default()).await;
     edge.next_state_of("euclid").await;
     let mut mallory = Stranger::connect(&address).await;
     assert!(

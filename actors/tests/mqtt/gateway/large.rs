@@ -8,7 +8,9 @@ use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, MqttConfig, SubscriptionRole};
 
-use crate::gateway::cell::{LOOPBACK, Node, Stranger, embedded, map, name, topic, until};
+use crate::gateway::cell::{
+    LOOPBACK, Node, Stranger, edge_and_vehicle, embedded, map, name, topic, until,
+};
 
 /// A map as it is when every location is known to four vehicles.
 fn large_map(round: u64, landmarks: usize) -> Arc<GlobalMap> {
@@ -45,14 +47,7 @@ async fn a_follower_gets_the_map_of_a_cell_with_16384_known_locations() {
             encoding,
             ..MqttConfig::default()
         };
-        let edge = Node::join(
-            "edge",
-            SubscriptionRole::Candidate,
-            mqtt.clone(),
-            &[&address],
-        )
-        .await;
-        let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
+        let (edge, mut euclid) = edge_and_vehicle(&address, mqtt).await;
         euclid.next_state_of("edge").await;
         for (round, landmarks) in [(1, 4096), (2, 16_384)] {
             let sent = large_map(round, landmarks);
@@ -73,14 +68,7 @@ async fn a_map_beyond_the_limit_is_counted_and_told_of_and_costs_no_link() {
         ..MqttConfig::default()
     };
     let (_broker, address) = embedded();
-    let edge = Node::join(
-        "edge",
-        SubscriptionRole::Candidate,
-        mqtt.clone(),
-        &[&address],
-    )
-    .await;
-    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
+    let (edge, mut euclid) = edge_and_vehicle(&address, mqtt).await;
     euclid.next_state_of("edge").await;
     edge.send(GatewayMessage::PublishMap {
         map: large_map(1, 100),

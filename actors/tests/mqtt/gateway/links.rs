@@ -12,12 +12,11 @@ use ecod_actors::transport::mqtt::{
 };
 use tokio::task::JoinHandle;
 
-use crate::gateway::cell::{LOOPBACK, Node, embedded, map, name, until};
+use crate::gateway::cell::{LOOPBACK, Node, edge_and_vehicle, embedded, map, name, until};
 use crate::mosquitto::Mosquitto;
 
 async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
-    let mut edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[broker]).await;
-    let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[broker]).await;
+    let (mut edge, mut euclid) = edge_and_vehicle(broker, mqtt).await;
     settle(&mut edge, &euclid).await;
     euclid.report(1);
     assert_eq!(edge.next_report().await, (name("euclid"), 1));
@@ -82,13 +81,7 @@ async fn versions_mix_at_one_broker() {
         ..MqttConfig::default()
     };
     let mut edge = Node::join("edge", SubscriptionRole::Candidate, v5, &[&address]).await;
-    let euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let euclid = Node::follower("euclid", &address).await;
     settle(&mut edge, &euclid).await;
     euclid.report(3);
     assert_eq!(edge.next_report().await, (name("euclid"), 3));
@@ -191,20 +184,8 @@ async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
         &[&one, &two],
     )
     .await;
-    let mut left = Node::join(
-        "left",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&one],
-    )
-    .await;
-    let mut right = Node::join(
-        "right",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&two],
-    )
-    .await;
+    let mut left = Node::follower("left", &one).await;
+    let mut right = Node::follower("right", &two).await;
     settle(&mut left, &edge).await;
     settle(&mut right, &edge).await;
     for round in [1, 2] {
@@ -256,14 +237,7 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
             version,
             ..MqttConfig::default()
         };
-        let mut edge = Node::join(
-            "edge",
-            SubscriptionRole::Candidate,
-            mqtt.clone(),
-            &[&address],
-        )
-        .await;
-        let mut euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
+        let (mut edge, mut euclid) = edge_and_vehicle(&address, mqtt).await;
         settle(&mut edge, &euclid).await;
 
         broker.kill();
@@ -287,20 +261,7 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
 #[tokio::test]
 async fn a_restarted_embedded_broker_is_found_again() {
     let (mut broker, address) = embedded();
-    let mut edge = Node::join(
-        "edge",
-        SubscriptionRole::Candidate,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
-    let mut euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let (mut edge, mut euclid) = edge_and_vehicle(&address, MqttConfig::default()).await;
     for seq in 1..=3 {
         broker.restart(LOOPBACK).unwrap();
         edge.link(LinkState::Up).await;
@@ -321,13 +282,7 @@ async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
         &[&address],
     )
     .await;
-    let euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let euclid = Node::follower("euclid", &address).await;
     settle(&mut observer, &euclid).await;
     for wanted in [true, false] {
         observer.send(GatewayMessage::WatchReports { wanted });

@@ -78,29 +78,11 @@ async fn mosquitto_v5() {
 #[tokio::test]
 async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() {
     let (_broker, address) = embedded();
-    let first = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
-    let mut watcher = Node::join(
-        "gauss",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let first = Node::follower("euclid", &address).await;
+    let mut watcher = Node::follower("gauss", &address).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
     assert_eq!(first.counters.events(Event::NameConflict), 0);
-    let second = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let second = Node::follower("euclid", &address).await;
     for node in [&first, &second] {
         until("both know", || {
             node.counters.events(Event::NameConflict) > 0
@@ -123,21 +105,9 @@ async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() 
         );
     }
     second.stop().await;
-    let restarted = Node::join(
-        "riemann",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let restarted = Node::follower("riemann", &address).await;
     restarted.stop().await;
-    let restarted = Node::join(
-        "riemann",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let restarted = Node::follower("riemann", &address).await;
     until("it hears itself", || {
         restarted.counters.events(Event::Echo) > 0
     })
@@ -152,13 +122,7 @@ async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() 
 #[tokio::test]
 async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
     let (mut broker, address) = embedded();
-    let mut euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let mut euclid = Node::follower("euclid", &address).await;
     euclid.send(GatewayMessage::PublishStatus {
         status: NodeStatus {
             epoch: 7,
@@ -167,13 +131,7 @@ async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
     });
     broker.restart(LOOPBACK).unwrap();
     euclid.link(LinkState::Up).await;
-    let mut watcher = Node::join(
-        "gauss",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let mut watcher = Node::follower("gauss", &address).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
     euclid.kill().await;
     let epoch = watcher
@@ -190,20 +148,8 @@ async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
 #[tokio::test]
 async fn a_will_that_fires_late_is_put_right() {
     let (_broker, address) = embedded();
-    let euclid = Node::join(
-        "euclid",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
-    let mut watcher = Node::join(
-        "gauss",
-        SubscriptionRole::Follower,
-        MqttConfig::default(),
-        &[&address],
-    )
-    .await;
+    let euclid = Node::follower("euclid", &address).await;
+    let mut watcher = Node::follower("gauss", &address).await;
     assert_eq!(watcher.next_state_of("euclid").await, NodeState::Following);
 
     let will = NodeStatus {

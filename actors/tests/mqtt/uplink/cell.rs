@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use ecod::aggregator::Algorithms;
-use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{Role, Trouble};
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::transport::mqtt::BrokerAddress;
+use ecod_testkit::node_config;
 
 /// Maximum time for anything.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
@@ -24,17 +24,10 @@ pub(crate) const ORIGIN: GeographicOrigin = GeographicOrigin {
 /// An edge on loopback alone that leads a cell without known locations.
 pub(crate) fn config(cell: &'static str, broker: BrokerAddress) -> NodeConfig {
     let mut config = NodeConfig {
-        name: Some(NodeName::from_static("edge")),
-        cell: NodeName::from_static(cell),
-        role: Role::Edge,
-        listen: Some("127.0.0.1:0".parse().unwrap()),
         origin: Some(ORIGIN),
-        ..NodeConfig::default()
+        ..node_config("edge", cell, Role::Edge)
     };
     config.fusion.algorithms = Algorithms::Pace;
-    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
-    config.membership.multicast.enabled = false;
-    config.dashboard.enabled = false;
     config.uplink.broker = Some(broker);
     config.validate().unwrap();
     config

@@ -8,10 +8,11 @@ use ecod::wire::Role;
 use ecod_actors::node;
 use ecod_actors::observe::recorder::{RecordConfig, SchemaName, files};
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::recording::cell::{Log, config, free_address};
+use crate::recording::cell::{Log, config};
 
 /// A node as a process; killed when dropped.
 pub(crate) struct Process(pub(crate) Child);
@@ -38,9 +39,8 @@ pub(crate) fn edge(directory: &Path, prelude: &str) -> Process {
 
 /// The same in another role; its name is `edge` all the same.
 pub(crate) fn node_of(role: Role, directory: &Path, prelude: &str) -> Process {
-    let address = free_address();
     let file = directory.join("edge.toml");
-    let config = config("edge", role, Some(address), address, directory);
+    let config = config("edge", role, directory);
     std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
     let script = format!(
         "{prelude} exec {} --config {}",
@@ -166,8 +166,7 @@ fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
 async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
     for path in ["/dev/full", "/proc/maps.jsonl"] {
         let directory = tempfile::tempdir().unwrap();
-        let address = free_address();
-        let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+        let mut config = config("edge", Role::Edge, directory.path());
         (config.map_log, config.record) = (Some(path.into()), None);
         let node = node::start(config).await.unwrap();
         let mut maps = node.newest_map();
@@ -185,8 +184,7 @@ async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_directory_that_cannot_be_made_is_tried_again() {
     let directory = tempfile::tempdir().unwrap();
-    let address = free_address();
-    let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+    let mut config = config("edge", Role::Edge, directory.path());
     let dir = directory.path().join("blocked/log");
     std::fs::write(directory.path().join("blocked"), "a file").unwrap();
     config.record = Some(RecordConfig {
@@ -194,26 +192,16 @@ async fn a_directory_that_cannot_be_made_is_tried_again() {
         ..RecordConfig::new(&dir)
     });
     let node = node::start(config).await.unwrap();
-    let until = async |what: &str, holds: &dyn Fn() -> bool| {
-        let reached = async {
-            while !holds() {
-                tokio::time::sleep(Duration::from_millis(20)).await;
-            }
-        };
-        tokio::time::timeout(Duration::from_secs(30), reached)
-            .await
-            .unwrap_or_else(|_| panic!("never: {what}"));
-    };
     let counters = node.counters().clone();
-    until("failures are counted", &|| {
+    until("failures are counted", || {
         counters.events(Event::RecordFailed) > 0
     })
     .await;
-    until("the node leads", &|| node.newest_map().borrow().is_some()).await;
+    until("the node leads", || node.newest_map().borrow().is_some()).await;
     assert_eq!(counters.events(Event::Recorded), 0);
     assert!(counters.events(Event::RecordDropped) > 0);
     std::fs::remove_file(directory.path().join("blocked")).unwrap();
-    until("entries are written", &|| {
+    until("entries are written", || {
         counters.events(Event::Recorded) > 20
     })
     .await;

@@ -8,7 +8,7 @@ use ecod::wire::Role;
 use ecod_actors::node;
 use ecod_actors::telemetry::counters::Event;
 
-use crate::recording::cell::{config, free_address};
+use crate::recording::cell::config;
 
 /// Asks for the websocket and reads until all of these were said.
 fn view(port: u16, wanted: &[&str]) {
@@ -36,8 +36,7 @@ async fn viewers_are_offered_what_is_recorded_and_drawn() {
     let directory = tempfile::tempdir().unwrap();
     let taken = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
     let port = taken.local_addr().unwrap().port();
-    let address = free_address();
-    let mut config = config("edge", Role::Edge, Some(address), address, directory.path());
+    let mut config = config("edge", Role::Edge, directory.path());
     config.record.as_mut().unwrap().live_port = Some(port);
     let node = node::start(config).await.unwrap();
     let counters = node.counters().clone();

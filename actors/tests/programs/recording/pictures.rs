@@ -10,9 +10,10 @@ use ecod::wire::Role;
 use ecod_actors::node;
 use ecod_actors::observe::recorder::{SchemaName, files};
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::output_of;
 use serde_json::Value;
 
-use crate::recording::cell::{Log, config, free_address};
+use crate::recording::cell::{Log, config};
 
 /// Has a camera vehicle record pictures until it has looked at 30 frames, ten a second; gives that number and the time that
 /// it took. The frames have twice the pixels of the optics.
@@ -28,8 +29,7 @@ async fn record(directory: &Path) -> (usize, Duration) {
     let found =
         format!(r#"[{{"label": "car", "confidence": 0.93, "bounding_box": {bounding_box}}}]"#);
     std::fs::write(&detections, found + "\n").unwrap();
-    let address = free_address();
-    let mut config = config("euclid", Role::Auto, Some(address), address, directory);
+    let mut config = config("euclid", Role::Auto, directory);
     let camera = format!(
         "source = {{ kind = \"images\", path = {frames:?}, looping = true, fps = 10 }}\n\
          detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}\n\
@@ -133,16 +133,6 @@ async fn viewers_find_their_schemas_and_the_layout_its_topics() {
         env!("CARGO_MANIFEST_DIR"),
         "/../packaging/foxglove/ecod.json"
     );
-    let run = Command::new("node")
-        .arg(check)
-        .args(logs)
-        .arg(layout)
-        .output()
-        .unwrap();
-    assert!(
-        run.status.success(),
-        "{}",
-        String::from_utf8_lossy(&run.stderr)
-    );
-    print!("{}", String::from_utf8_lossy(&run.stdout));
+    let mut viewers = Command::new("node");
+    print!("{}", output_of(viewers.arg(check).args(logs).arg(layout)));
 }

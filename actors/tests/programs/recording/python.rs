@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use ecod_actors::observe::recorder::{SchemaName, files};
+use ecod_testkit::output_of;
 
 use crate::recording::cell::Log;
 use crate::recording::disk::{edge, maps, wait_until};
@@ -27,23 +28,10 @@ except Exception:
 /// The maps that Python finds in a log.
 fn maps_by(python: &str, dir: &Path, state: &str) -> usize {
     let read = |log: &std::path::PathBuf| {
-        let run = Command::new(python)
-            .args(["-c", SCRIPT])
-            .arg(log)
-            .arg(state)
-            .output()
-            .unwrap();
-        assert!(
-            run.status.success(),
-            "{}",
-            String::from_utf8_lossy(&run.stderr)
-        );
+        let mut reader = Command::new(python);
+        let text = output_of(reader.args(["-c", SCRIPT]).arg(log).arg(state));
         let is_map = |line: &&str| line.starts_with("ecod.GlobalMap ");
-        String::from_utf8(run.stdout)
-            .unwrap()
-            .lines()
-            .filter(is_map)
-            .count()
+        text.lines().filter(is_map).count()
     };
     files(dir).unwrap().iter().map(read).sum()
 }

@@ -15,6 +15,7 @@ use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
+use ecod_testkit::tls_files;
 use rustls::ClientConfig;
 use serde::Deserialize;
 use tempfile::TempDir;
@@ -506,14 +507,7 @@ fn issue(
 ) -> anyhow::Result<TlsConfig> {
     let name = NodeName::new(name)?;
     authority.issue(&name, rights, Duration::from_secs(86_400), clock::now())?;
-    let (certificate, key) = authority.files_of(&name);
-    Ok(TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
-        revocation_list: Some(authority.revocation_list()),
-        city: None,
-    })
+    Ok(tls_files(authority, &name))
 }
 
 fn configuration(

@@ -7,6 +7,7 @@ use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, Role, encode};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, EvidenceSigner, TlsConfig};
+use ecod_testkit::tls_files;
 
 use tokio::time::sleep;
 
@@ -59,13 +60,9 @@ async fn revoked(target: Target) -> anyhow::Result<()> {
 async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
     let (pki, leader) = (target.home.join("pki"), NodeName::from_static(LEADER));
     let mut authority = Authority::open(&pki)?;
-    let (certificate, key) = authority.files_of(&leader);
     let files = TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
         revocation_list: None,
-        city: None,
+        ..tls_files(&authority, &leader)
     };
     let signer = EvidenceSigner::new(
         NodeName::from_static(CELL),

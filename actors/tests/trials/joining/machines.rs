@@ -1,14 +1,13 @@
 //! The README's commands on three machines: network namespaces with an `/etc` and a `/var/lib` of their own.
 
 use std::fs::{self, File};
-use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use tempfile::TempDir;
 
-use crate::joining::{Running, said, until};
+use crate::joining::{Running, said, tokens, until};
 use crate::network::{Bridged, namespace};
 
 /// Stands for systemd, which namespaces lack: a service runs by the command of its unit, and is noted as enabled.
@@ -205,16 +204,7 @@ fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
             .spawn()
             .unwrap(),
     );
-    let lines = BufReader::new(host.0.stdout.take().unwrap()).lines();
-    let tokens = lines.filter_map(|line| {
-        Some(
-            line.unwrap()
-                .trim()
-                .strip_prefix("sudo ecod-node join ")?
-                .to_owned(),
-        )
-    });
-    let tokens: Vec<_> = tokens.take(2).collect();
+    let tokens = tokens(&mut host, 2);
     for (machine, token) in [euclid, gauss].into_iter().zip(&tokens) {
         let told = machine.run(&join.replace("TOKEN", token));
         assert!(

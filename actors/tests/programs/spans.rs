@@ -1,8 +1,10 @@
 //! A detection's way through two processes, as a collector of spans gets it.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
-use std::process::Stdio;
+use std::fs::{self, File};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -10,11 +12,7 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::routing::post;
-use ecod::testbed::Testbed;
-use ecod_actors::camera::frame_source::SourceConfig;
-use ecod_actors::node::config::NodeConfig;
-use ecod_actors::node_process::free_address;
-use ecod_actors::testbed::setup;
+use ecod_testkit::{PATIENCE, car_ahead, command};
 use hyper::server::conn::http1;
 use hyper_util::rt::TokioIo;
 use hyper_util::service::TowerToHyperService;
@@ -23,12 +21,15 @@ use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::trace::v1::Span;
 use prost::Message;
 use tokio::net::TcpListener;
-use tokio::process::{Child, Command};
 use tokio::time::timeout;
 use uuid::Uuid;
 
-const PATIENCE: Duration = Duration::from_secs(60);
-const SCENE: &str = "setup1-lot1";
+/// What both nodes have in their files.
+const CELL: &str = r#"
+    listen = "127.0.0.1:0"
+    membership = { bind = "127.0.0.1:0", multicast = { enabled = false } }
+    dashboard = { enabled = false }
+"#;
 
 /// The spans that came, each with the service it is of.
 type Spans = Arc<Mutex<Vec<(String, Span)>>>;
@@ -82,21 +83,79 @@ fn attributes(
         .collect()
 }
 
-fn node(config: &NodeConfig, directory: &Path, collector: &str) -> Child {
-    let name = config.name.as_ref().unwrap().as_str();
+/// A node as a process; killed when dropped.
+struct Process(Child);
+
+impl Process {
+    /// Ends a node by the end of its input.
+    async fn end(mut self) {
+        drop(self.0.stdin.take());
+        let ended = async {
+            loop {
+                if let Some(status) = self.0.try_wait().unwrap() {
+                    return status;
+                }
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        let status = timeout(PATIENCE, ended)
+            .await
+            .expect("the node does not end");
+        assert!(status.success(), "{status}");
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().unwrap();
+    }
+}
+
+/// Starts a node with this configuration; its log goes into the directory.
+fn node(name: &str, config: &str, directory: &Path, collector: &str) -> Process {
     let file = directory.join(format!("{name}.toml"));
-    std::fs::write(&file, toml::to_string(config).unwrap()).unwrap();
-    Command::new(env!("CARGO_BIN_EXE_ecod-node"))
-        .arg("--config")
+    fs::write(&file, format!("name = \"{name}\"\n{CELL}\n{config}")).unwrap();
+    let log = File::create(directory.join(format!("{name}.log"))).unwrap();
+    let process = command(env!("CARGO_BIN_EXE_ecod-node"))
+        .args(["--log-format", "text", "--stop-at-eof", "--config"])
         .arg(file)
-        .arg("--stop-at-eof")
+        .env_remove("RUST_LOG")
         .env("OTEL_EXPORTER_OTLP_ENDPOINT", collector)
         .env("OTEL_SERVICE_NAME", name)
         .env("OTEL_BSP_SCHEDULE_DELAY", "200")
         .stdin(Stdio::piped())
-        .kill_on_drop(true)
+        .stderr(log)
         .spawn()
-        .unwrap()
+        .unwrap();
+    Process(process)
+}
+
+/// Address of the edge's broker, as soon as the edge logs it.
+async fn broker(directory: &Path) -> SocketAddr {
+    let logged = async {
+        loop {
+            let log = fs::read_to_string(directory.join("edge.log")).unwrap();
+            if let Some((address, _)) = log
+                .split_once("broker serves address=")
+                .and_then(|(_, rest)| rest.split_once('\n'))
+            {
+                return address.parse().unwrap();
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, logged)
+        .await
+        .expect("the edge does not listen")
+}
+
+/// A vehicle before whose camera a car always stands.
+fn vehicle(broker: SocketAddr, directory: &Path) -> String {
+    format!(
+        "role = \"cav\"\nmqtt = {{ broker = \"{broker}\" }}\n[camera]\n{}",
+        car_ahead(directory)
+    )
 }
 
 /// Spans of one detection: by name, from frame to acceptance.
@@ -159,30 +218,12 @@ fn way(spans: &[(String, Span)]) -> Option<Way> {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_accepts() {
-    let scenes =
-        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
-    let testbed = Testbed::from_json(&std::fs::read_to_string(&scenes).unwrap()).unwrap();
-    let scene = testbed.scene(SCENE).unwrap();
-    let address = free_address().unwrap();
-    let mut edge = setup::edge(&testbed, scene);
-    edge.listen = Some(address);
-    let euclid = scene
-        .cavs
-        .iter()
-        .find(|cav| cav.name.as_str() == "euclid")
-        .unwrap();
-    let source = SourceConfig::Testbed {
-        scenes,
-        scene: SCENE.into(),
-        cav: euclid.name.clone(),
-        seed: 7,
-    };
-    let mut euclid = setup::cav(&testbed, scene, euclid, source);
-    euclid.mqtt.broker = Some(address.into());
-
     let (endpoint, spans) = collector().await;
     let directory = tempfile::tempdir().unwrap();
-    let mut nodes = [&edge, &euclid].map(|config| node(config, directory.path(), &endpoint));
+    let directory = directory.path();
+    let edge = node("edge", "role = \"edge\"", directory, &endpoint);
+    let vehicle = vehicle(broker(directory).await, directory);
+    let nodes = [edge, node("euclid", &vehicle, directory, &endpoint)];
     let followed = async {
         loop {
             tokio::time::sleep(Duration::from_millis(100)).await;
@@ -214,15 +255,8 @@ async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_acce
     );
 
     // The last spans go out as a node ends.
-    for node in &mut nodes {
-        drop(node.stdin.take());
-        assert!(
-            timeout(PATIENCE, node.wait())
-                .await
-                .unwrap()
-                .unwrap()
-                .success()
-        );
+    for node in nodes {
+        node.end().await;
     }
     let spans = spans.lock().unwrap();
     let names: Vec<_> = spans.iter().map(|(_, span)| &*span.name).collect();

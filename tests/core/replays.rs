@@ -21,7 +21,7 @@ fn lot() -> ReplayConfig {
         name,
         fusion,
         landmarks,
-    } = toml::from_str(include_str!("../examples/recordings/lot.toml")).unwrap();
+    } = toml::from_str(include_str!("../../examples/recordings/lot.toml")).unwrap();
     let landmarks = landmarks.iter().map(Landmark::from).collect();
     ReplayConfig {
         aggregator: name.parse().unwrap(),
@@ -34,7 +34,7 @@ fn lot() -> ReplayConfig {
 /// Digest of all lines of output.
 fn digest(config: ReplayConfig) -> String {
     let mut replay = Replay::new(config);
-    let recording = include_str!("../examples/recordings/lot.jsonl");
+    let recording = include_str!("../../examples/recordings/lot.jsonl");
     let mut rounds: Vec<FusedLine> = recording
         .lines()
         .flat_map(|line| replay.line(line.as_bytes()))

@@ -1,0 +1,34 @@
+//! Waiting for a condition, with a deadline.
+
+use std::time::Duration;
+
+use tokio::time::{Instant, sleep};
+
+/// Time for any step, on a machine that runs other tests at once.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Waits until the condition holds. The result is the time that it took.
+///
+/// # Panics
+/// Panics if the condition does not hold within [`PATIENCE`].
+pub async fn until(what: &str, mut holds: impl FnMut() -> bool) -> Duration {
+    let started = Instant::now();
+    while !holds() {
+        assert!(started.elapsed() < PATIENCE, "never: {what}");
+        sleep(Duration::from_millis(10)).await;
+    }
+    started.elapsed()
+}
+
+/// Repeats an action every 20 ms until the condition holds.
+///
+/// # Panics
+/// Panics if the condition does not hold within [`PATIENCE`].
+pub async fn until_by(what: &str, mut act: impl FnMut(), mut holds: impl FnMut() -> bool) {
+    let started = Instant::now();
+    while !holds() {
+        assert!(started.elapsed() < PATIENCE, "never: {what}");
+        act();
+        sleep(Duration::from_millis(20)).await;
+    }
+}
