@@ -6,10 +6,12 @@ use ecod::leadership::Position;
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep};
 
 use crate::fixture::{DAY, Pki, SOON, node as name};
-use crate::nodes::{aggregator, start_cell, until};
+use crate::nodes::{aggregator, start_cell, start_with, until};
 
 /// Longest time without a map on a machine that does much else: rounds follow each other in 0.1 s.
 const LONGEST_GAP: Duration = Duration::from_millis(350);
@@ -105,4 +107,31 @@ async fn every_node_names_the_end_of_its_own_certificate_and_a_far_end_moves_no_
     for node in nodes {
         node.stop().await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn prometheus_reads_how_long_the_certificate_is_valid() {
+    let mut pki = Pki::new();
+    let files = pki.issue("edge", Role::Edge, DAY);
+    let edge = start_with("edge", Role::Edge, files, None, |config| {
+        config.dashboard.enabled = true;
+        config.dashboard.listen = Some("127.0.0.1:0".parse().unwrap());
+    })
+    .await;
+    let mut page = edge.dashboard_address();
+    let page = page.wait_for(Option::is_some).await.unwrap().unwrap();
+    let mut stream = TcpStream::connect(page).await.unwrap();
+    let request = format!("GET /metrics HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    let line = answer
+        .lines()
+        .find_map(|line| line.strip_prefix("ecod_certificate_remaining_seconds "));
+    let left_s: f64 = line.unwrap_or_else(|| panic!("{answer}")).parse().unwrap();
+    assert!(
+        (DAY.as_secs_f64() - 60.0..=DAY.as_secs_f64()).contains(&left_s),
+        "{left_s}"
+    );
+    edge.stop().await;
 }
