@@ -302,6 +302,7 @@ impl Aggregator {
                 self.voted = true;
             }
         }
+        self.expelled.note_report(&report.node.vehicle(), now);
         Ok(if self.rounds.report(kind, &report.node, now) {
             self.close(now)
         } else {

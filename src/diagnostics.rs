@@ -103,6 +103,8 @@ trouble_kinds! {
     OtherCell = "other_cell", LONG, "give both nodes the same `cell`, if they belong together";
     /// A node that cannot show a certificate which this one accepts.
     NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
+    /// The node's own certificate ends soon, or has ended.
+    CertificateEnds = "certificate_ends", UNTIL_SETTLED, "create a new one by `ecod-node pki issue`, and copy its two files here: no restart";
     /// A second running node of a name.
     NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
     /// An unanswered seed at a node that has discovered no other member.

@@ -30,7 +30,7 @@ pub use replication::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
 use crate::config::config_section;
 use crate::model::names::{Label, NodeName};
-use crate::wire::ForeignVotes;
+use crate::wire::{ForeignVotes, MAX_INTEGER};
 
 /// A settled vote: it is final whether the vote agreed with the verdict.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -43,7 +43,8 @@ pub struct Evidence {
     pub correct: bool,
 }
 
-/// Numbers of votes that agreed and disagreed with the verdict.
+/// Numbers of votes that agreed and disagreed with the verdict. Counting and adding stop at
+/// [`MAX_INTEGER`], the largest count that receivers accept.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counts {
@@ -71,13 +72,13 @@ impl Counts {
         } else {
             &mut self.incorrect
         };
-        *count = count.saturating_add(1);
+        *count = sum(*count, 1);
     }
 
     fn plus(self, other: Self) -> Self {
         Self {
-            correct: self.correct.saturating_add(other.correct),
-            incorrect: self.incorrect.saturating_add(other.incorrect),
+            correct: sum(self.correct, other.correct),
+            incorrect: sum(self.incorrect, other.incorrect),
         }
     }
 
@@ -92,6 +93,10 @@ impl Counts {
         self.correct = self.correct.max(other.correct);
         self.incorrect = self.incorrect.max(other.incorrect);
     }
+}
+
+fn sum(one: u64, other: u64) -> u64 {
+    one.saturating_add(other).min(MAX_INTEGER)
 }
 
 config_section! {

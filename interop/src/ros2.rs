@@ -90,12 +90,17 @@ fn ros_name(node: &NodeName) -> String {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used)]
+    #![allow(clippy::unwrap_used, clippy::indexing_slicing)]
+
+    use std::collections::BTreeMap;
 
     use ecod::model::epoch::Epoch;
     use ecod::model::geometry::Covariance;
     use ecod::model::time::Timestamp;
-    use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
+    use ecod::wire::{FusedObject, LandmarkState, Limits, PerceivedObject, WirePose};
+    use proptest::collection::vec;
+    use proptest::option;
+    use proptest::prelude::*;
 
     use super::*;
     use crate::ros2::messages::RosTime;
@@ -177,6 +182,101 @@ mod tests {
             opacity[..2].iter().all(|a| *a < 0.05) && opacity[2..].iter().all(|a| *a > 0.8),
             "{drawn}"
         );
+    }
+
+    /// A number within a bound of the wire format, often at it.
+    fn up_to(bound: f64) -> impl Strategy<Value = f64> {
+        prop_oneof![-bound..=bound, -10.0..=10.0, Just(bound), Just(-bound)]
+    }
+
+    prop_compose! {
+        fn extreme_detection()(
+            (x_m, y_m, confidence) in (up_to(1e8), up_to(1e8), 0.0..=1.0),
+            variance in option::of(up_to(7e19).prop_map(f64::abs)),
+            velocity_mps in option::of([up_to(1e4), up_to(1e4)]),
+            heading_rad in option::of(up_to(1e6)),
+            size_m in option::of([up_to(102_400.0).prop_map(f64::abs), up_to(102_400.0).prop_map(f64::abs)]),
+            label in prop_oneof![Just("car".to_owned()), "\\PC{1,16}"],
+            score in 0.0..=1.0,
+        ) -> PerceivedObject {
+            PerceivedObject {
+                covariance_m2: variance.map(|variance| [variance, 0.0, variance]),
+                scores: [("truck".into(), score)].into(),
+                velocity_mps, heading_rad, size_m,
+                ..PerceivedObject::new(label, confidence, x_m, y_m)
+            }
+        }
+    }
+
+    /// Checks every message: it is encoded, and each number in it is finite, because JSON writes
+    /// others as null.
+    #[derive(Default)]
+    struct Checked(BTreeMap<String, Vec<u8>>);
+
+    impl RosSink for Checked {
+        type Error = TestCaseError;
+
+        fn put<M: Serialize + Definition>(
+            &mut self,
+            topic: &str,
+            message: &M,
+        ) -> Result<(), Self::Error> {
+            let json = serde_json::to_string(message).unwrap();
+            prop_assert!(!json.contains("null"), "{}: {}", topic, json);
+            let bytes = cdr_encoding::to_vec::<M, byteorder::LittleEndian>(message).unwrap();
+            self.0.insert(topic.to_owned(), bytes);
+            Ok(())
+        }
+    }
+
+    impl Checked {
+        /// Number of detections that a receiver decodes from a topic's message.
+        fn detections(&self, topic: &str) -> usize {
+            let (message, _) =
+                cdr_encoding::from_bytes::<Detection3DArray, byteorder::LittleEndian>(
+                    &self.0[topic],
+                )
+                .unwrap();
+            message.detections.len()
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_valid_map_and_report_is_messages_that_receivers_decode(
+            seen in vec(extreme_detection(), 0..8),
+            pose in option::of((up_to(1e8), up_to(1e8), up_to(1e300))),
+            at in prop_oneof![Just(NOW.0), 0..(1u64 << 53)],
+        ) {
+            let (edge, at) = (NodeName::from_static("edge"), Timestamp(at));
+            let fused = |(number, seen): (usize, &PerceivedObject)| FusedObject {
+                velocity_mps: seen.velocity_mps,
+                heading_rad: seen.heading_rad,
+                size_m: seen.size_m,
+                scores: seen.scores.clone(),
+                covariance_m2: seen.covariance_m2.unwrap_or([0.04, 0.0, 0.04]),
+                ..FusedObject::new(
+                    uuid::Uuid::from_u128(number as u128),
+                    seen.label.clone(),
+                    seen.confidence,
+                    seen.x_m,
+                    seen.y_m,
+                    Covariance::isotropic(0.04),
+                )
+            };
+            let map = GlobalMap {
+                objects: seen.iter().enumerate().map(fused).collect(),
+                ..GlobalMap::new(&Epoch::new(7, edge.clone()), 1, at)
+            };
+            let mut sink = Checked::default();
+            put_map(&map, &mut sink)?;
+            prop_assert_eq!(sink.detections("/ecod/map/detections"), seen.len());
+            let pose = pose.map(|(x_m, y_m, heading_rad)| WirePose::new(x_m, y_m, heading_rad));
+            let report = ObjectReport { pose, objects: seen.clone(), ..ObjectReport::new(edge, 1, at) };
+            prop_assert_eq!(report.validate(&Limits::default()), Ok(()));
+            put_report(&report, &mut sink)?;
+            prop_assert_eq!(sink.detections("/ecod/edge/detections"), seen.len());
+        }
     }
 
     #[test]

@@ -128,6 +128,56 @@ fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
 }
 
 #[test]
+fn vehicles_that_are_expelled_one_after_the_other_leave_no_common_object() {
+    let mut cell = leader(FusionConfig {
+        tracks: TracksConfig {
+            mode: TracksMode::On,
+            ..TracksConfig::default()
+        },
+        round: RoundConfig {
+            close: RoundClose::Periodic,
+            ..RoundConfig::default()
+        },
+        ..FusionConfig::default()
+    });
+    let (mallory, watson) = (
+        NodeName::from_static("mallory"),
+        NodeName::from_static("watson"),
+    );
+    let contributors = |cell: &mut Aggregator, rounds: std::ops::Range<u64>| {
+        let mut last = Vec::new();
+        for round in rounds {
+            let now = at(round * 100);
+            for (node, until) in [(&mallory, 20), (&watson, 30)] {
+                if round < until {
+                    let report = ObjectReport {
+                        objects: vec![PerceivedObject::new("car", 0.9, 20.0, 30.0)],
+                        ..ObjectReport::new(node.clone(), round, at(round * 100 - 20))
+                    };
+                    let report = Arc::new(report);
+                    cell.report(Detections, &report, now - Duration::from_millis(10))
+                        .unwrap();
+                }
+            }
+            let map = cell.tick(now).and_then(|fused| fused.map);
+            last = map.map_or(last, |map| {
+                let objects = map.objects.into_iter();
+                objects.map(|object| object.contributors).collect()
+            });
+        }
+        last
+    };
+    assert_eq!(
+        contributors(&mut cell, 1..20),
+        [vec![mallory.clone(), watson.clone()]]
+    );
+    cell.expel(mallory.clone(), at(1950));
+    assert_eq!(contributors(&mut cell, 20..30), [vec![watson.clone()]]);
+    cell.expel(watson.clone(), at(2950));
+    assert_eq!(contributors(&mut cell, 30..32), Vec::<Vec<NodeName>>::new());
+}
+
+#[test]
 fn a_round_is_closed_for_map_and_verdicts_together() {
     let round = RoundConfig {
         close: RoundClose::Periodic,

@@ -1,6 +1,7 @@
 //! The core as its users call it: fusion by PACE, tracking, VOTE, replays, and the program that the README shows; and the
 //! imports between its modules.
 
+mod accepted_by_receivers;
 mod examples;
 mod messages;
 mod moving_on;

@@ -1,18 +1,13 @@
 //! Checks of the node's certificates and their expiry, in its own cell and in the cells to which it
 //! moves.
 
-use std::os::unix::fs::PermissionsExt;
-use std::time::Duration;
-
 use rustls::pki_types::UnixTime;
+use std::os::unix::fs::PermissionsExt;
 
 use super::Finding;
 use crate::node::config::{CellEntry, NodeConfig};
 use crate::platform::clock;
 use crate::transport::pki::{CertificateSubject, Credentials, CredentialsError};
-
-/// Remaining validity below which a certificate should be replaced.
-const SOON: Duration = Duration::from_secs(30 * 86_400);
 
 /// Checks the certificates of the configuration, or their absence.
 pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
@@ -101,7 +96,7 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
             format!("{shown}, no revocation list"),
             "set `tls.revocation_list`",
         )
-    } else if left < SOON {
+    } else if identity.due_for_renewal(clock::now()).is_some() {
         Finding::doubtful(
             check,
             shown,

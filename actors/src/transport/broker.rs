@@ -8,6 +8,7 @@ mod byte_throttle;
 mod client_rejection;
 mod connect_packet;
 mod connection_throttle;
+mod departures;
 mod door;
 mod embedded;
 mod frontend;
@@ -27,7 +28,7 @@ use std::net::SocketAddr;
 #[cfg(fuzzing)]
 pub use connect_packet::read_connect_packet;
 pub use door::{Door, DoorSetup};
-pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
+pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, ExpulsionSink, MqttBroker};
 pub use permissions::AccessPolicy;
 pub use principal::LeaderCheck;
 #[cfg(fuzzing)]

@@ -17,6 +17,7 @@ mod nodes;
 mod packets;
 mod payloads;
 mod resources;
+mod revoked_client;
 mod shares;
 mod stolen_leader;
 mod topics;

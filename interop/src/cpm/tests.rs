@@ -131,6 +131,27 @@ fn extreme_detection() -> impl Strategy<Value = PerceivedObject> {
         )
 }
 
+fn extreme_object() -> impl Strategy<Value = FusedObject> {
+    let times = (
+        proptest::option::of(up_to(4e15).prop_map(f64::abs)),
+        proptest::option::of(0..(1u64 << 53)),
+    );
+    (any::<u64>(), extreme_detection(), times).prop_map(|(id, seen, (age_s, first_seen))| {
+        let covariance = seen.covariance_m2.unwrap_or([0.04, 0.0, 0.04]);
+        FusedObject {
+            confidence: seen.confidence,
+            y_m: seen.y_m,
+            covariance_m2: covariance,
+            velocity_mps: seen.velocity_mps,
+            heading_rad: seen.heading_rad,
+            size_m: seen.size_m,
+            age_s,
+            first_seen_us: first_seen.map(Timestamp),
+            ..fused(u128::from(id) + 100, seen.x_m)
+        }
+    })
+}
+
 proptest! {
     #[test]
     fn extreme_objects_of_one_vehicle_cost_the_message_no_others(
@@ -146,6 +167,55 @@ proptest! {
         for object in &sent.objects[..5] {
             let is_it = |other: &PerceivedObject| (other.x_m - object.x_m).hypot(other.y_m - object.y_m) < 0.009;
             prop_assert!(received.objects.iter().any(is_it), "{:?} is missing", object);
+        }
+    }
+
+    #[test]
+    fn extreme_objects_and_places_cost_the_message_of_a_map_no_others(
+        extreme in proptest::collection::vec(extreme_object(), 0..6),
+        places in proptest::collection::vec((up_to(1e8), up_to(1e8), 0.0..=1.0), 0..4),
+        rotation_deg in -180.0..180.0,
+    ) {
+        let ordinary = (1..6).map(|number| fused(number, 12.0 + 3.0 * number as f64));
+        let places = places.into_iter().map(|(x_m, y_m, confidence)| LandmarkState {
+            id: "far".into(),
+            label: Some("car".into()),
+            confidence,
+            x_m,
+            y_m,
+            contributors: Vec::new(),
+            observers: Vec::new(),
+            readings: Vec::new(),
+        });
+        let sent = map(ordinary.chain(extreme).collect(), places.collect());
+        let valid = ecod::wire::encode(&sent, ecod::wire::Encoding::Cbor);
+        let (_, invalid) = ecod::wire::decode_entries::<GlobalMap>(&valid, &Limits::default()).unwrap();
+        prop_assert_eq!(invalid, Vec::new());
+        let message = encode_map(&sent, &cell(rotation_deg), 7, &mut ObjectIds::default(), |_| true).unwrap();
+        let received = decode(&message.bytes, &origin(rotation_deg)).unwrap();
+        // Objects that were last detected over two seconds ago are not used.
+        let all = sent.objects.len() + sent.landmarks.len();
+        let old = sent.objects.iter().filter(|object| object.age_s.unwrap_or(0.0) > 2.0).count();
+        let counted = received.objects.len() + message.left_out;
+        prop_assert!((all - old..=all).contains(&counted), "{} of {}, {} old", counted, all, old);
+        for object in &sent.objects[..5] {
+            let is_it = |other: &PerceivedObject| (other.x_m - object.x_m).hypot(other.y_m - object.y_m) < 0.009;
+            prop_assert!(received.objects.iter().any(is_it), "{:?} is missing", object);
+        }
+    }
+
+    #[test]
+    fn a_report_of_any_pose_is_encoded_or_refused(
+        (x_m, y_m) in (up_to(1e8), up_to(1e8)),
+        heading_rad in prop_oneof![up_to(1e6), up_to(f64::MAX / 2.0)],
+        objects in proptest::collection::vec(extreme_detection(), 0..4),
+        seq in any::<u64>(),
+    ) {
+        let sent = ObjectReport { pose: Some(WirePose::new(x_m, y_m, heading_rad)), seq, ..report(objects) };
+        prop_assert!(sent.validate(&Limits::default()).is_ok());
+        if let Ok(message) = encode_report(&sent, &cell(0.0), 7) {
+            let received = decode(&message.bytes, &origin(0.0));
+            prop_assert!(received.is_ok(), "{:?}", received.err());
         }
     }
 

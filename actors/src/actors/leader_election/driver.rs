@@ -4,6 +4,7 @@
 use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::cell_time::{CellTime, ClockEvent, WrongClock};
@@ -33,6 +34,7 @@ use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
+use crate::transport::pki::Credentials;
 
 /// The node's leadership and the destinations of its effects.
 pub struct ElectionDriver {
@@ -335,8 +337,8 @@ impl ElectionDriver {
         Vec::new()
     }
 
-    /// Records troubles: wrong clocks, the leader's complaint, and an unused description of the
-    /// cell.
+    /// Records troubles: wrong clocks, the leader's complaint, the end of the node's own
+    /// certificate, and an unused description of the cell.
     fn note_troubles(&self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
         for clock in self.cell_time.wrong_clocks(clock::now()) {
@@ -361,6 +363,13 @@ impl ElectionDriver {
         if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
             let cause = format!("{leader} says of this node: {cause}");
             troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
+        }
+        let certificate = self.life_signs.credentials().map(Credentials::current);
+        let left =
+            certificate.and_then(|certificate| certificate.identity.due_for_renewal(clock::wall()));
+        match left {
+            Some(left) => troubles.note(TroubleKind::CertificateEnds, &ending(left)),
+            None => troubles.settle(TroubleKind::CertificateEnds, None),
         }
         match &self.parts.shared.borrow().problem {
             Some(problem) => troubles.note(TroubleKind::Description, problem),
@@ -414,6 +423,21 @@ fn as_seen(member: &Member) -> node::SeenMember {
         run: member.run,
         broker: member.broker.map(BrokerAddress::from),
         is_on_this_machine: is_of_this_machine(member.gossip.ip()),
+    }
+}
+
+/// The remaining validity of the node's own certificate as text.
+fn ending(left: Duration) -> String {
+    let count = |number: u64, unit: &str| {
+        let plural = if number == 1 { "" } else { "s" };
+        format!("this node's certificate ends in {number} {unit}{plural}")
+    };
+    match left.as_secs() {
+        0 => "this node's certificate has ended".to_owned(),
+        seconds @ ..60 => count(seconds, "second"),
+        seconds @ ..3600 => count(seconds / 60, "minute"),
+        seconds @ ..86_400 => count(seconds / 3600, "hour"),
+        seconds => count(seconds / 86_400, "day"),
     }
 }
 

@@ -13,6 +13,7 @@ use super::{NodeBuilder, cause};
 use crate::actors::broker::Broker;
 use crate::actors::membership::Membership;
 use crate::messages::broker::BrokerMessage;
+use crate::messages::fuser::FuserMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::platform::clock;
 use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
@@ -96,7 +97,13 @@ impl NodeBuilder {
             elected,
             counters,
         };
-        EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
+        let fuser = self.slots.fuser.clone();
+        EmbeddedBroker::protected(config, policy)
+            .with_door(self.door.clone())
+            .with_expulsions(Arc::new(move |node| {
+                tracing::warn!(%node, "client's certificate not trusted any more");
+                fuser.send(FuserMessage::Expel { node });
+            }))
     }
 
     /// Restarts the membership at its former address, like the broker.

@@ -38,6 +38,7 @@ pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
     node(&mut registry, monitor);
     troubles(&mut registry, monitor);
+    certificate(&mut registry, monitor);
     election(&mut registry, monitor);
     rounds(&mut registry, monitor);
     traffic(&mut registry, monitor);
@@ -136,6 +137,20 @@ fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {
             "Machine's clock less the cell's time",
             Unit::Seconds,
             ahead,
+        );
+    }
+}
+
+fn certificate(registry: &mut Registry, monitor: &NodeMonitor) {
+    if let Some(credentials) = &monitor.sources.vitals.security.credentials {
+        let expires = credentials.current().identity.expires();
+        let left = FloatGauge::default();
+        left.set(expires.since(clock::wall()).as_secs_f64());
+        registry.register_with_unit(
+            "certificate_remaining",
+            "Validity of the node's certificate that remains",
+            Unit::Seconds,
+            left,
         );
     }
 }

@@ -8,6 +8,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::model::names::NodeName;
 use rmqtt::context::ServerContext;
 use rmqtt::net::{Builder, Listener};
 use rmqtt::server::MqttServer;
@@ -186,12 +187,16 @@ impl BrokerConfig {
     }
 }
 
+/// Callback with the name in the certificate of a present or recent client, when the certificate is
+/// not trusted any more, for example because it was revoked. It must not block.
+pub type ExpulsionSink = Arc<dyn Fn(NodeName) + Send + Sync>;
+
 /// rmqtt as a library, on one thread, with retained messages in memory.
-#[derive(Default)]
 pub struct EmbeddedBroker {
     config: BrokerConfig,
     policy: Option<AccessPolicy>,
     door: Door,
+    expelled: ExpulsionSink,
     running: Option<RunningBroker>,
 }
 
@@ -225,24 +230,29 @@ impl EmbeddedBroker {
             config,
             policy: None,
             door: Door::default(),
+            expelled: Arc::new(drop),
             running: None,
         }
     }
 
     /// A broker behind a frontend with an access policy, not started.
     pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
-        Self {
-            config,
-            policy: Some(policy),
-            door: Door::default(),
-            running: None,
-        }
+        let mut broker = Self::new(config);
+        broker.policy = Some(policy);
+        broker
     }
 
     /// The same broker, with a connection for the node's local programs.
     #[must_use]
     pub fn with_door(mut self, door: Door) -> Self {
         self.door = door;
+        self
+    }
+
+    /// The same broker, which reports clients whose certificates are not trusted any more.
+    #[must_use]
+    pub fn with_expulsions(mut self, expelled: ExpulsionSink) -> Self {
+        self.expelled = expelled;
         self
     }
 }
@@ -257,12 +267,23 @@ impl MqttBroker for EmbeddedBroker {
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
         let heartbeat = ThreadHeartbeat::default();
-        let (config, policy, door) = (self.config.clone(), self.policy.clone(), self.door.clone());
+        let (config, policy) = (self.config.clone(), self.policy.clone());
+        let callbacks = Callbacks {
+            door: self.door.clone(),
+            expelled: Arc::clone(&self.expelled),
+        };
         let beats = heartbeat.beats();
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || {
-                serve(address, &config, (policy, door), &beats, &ready, stopped);
+                serve(
+                    address,
+                    &config,
+                    (policy, callbacks),
+                    &beats,
+                    &ready,
+                    stopped,
+                );
                 drop::<mpsc::Sender<()>>(ending);
             })
             .map_err(thread_error)?;
@@ -333,12 +354,19 @@ impl Drop for EmbeddedBroker {
     }
 }
 
+/// The parts of the node that the broker's thread calls.
+#[derive(Clone)]
+struct Callbacks {
+    door: Door,
+    expelled: ExpulsionSink,
+}
+
 /// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the
 /// caller's async code.
 fn serve(
     address: SocketAddr,
     config: &BrokerConfig,
-    (policy, door): (Option<AccessPolicy>, Door),
+    (policy, callbacks): (Option<AccessPolicy>, Callbacks),
     beats: &AtomicU64,
     ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
     stopped: oneshot::Receiver<()>,
@@ -354,7 +382,7 @@ fn serve(
     };
     runtime.block_on(async {
         let (server, frontend, bound, context) =
-            match prepare(address, config, policy, door.clone()).await {
+            match prepare(address, config, policy, callbacks.clone()).await {
                 Ok(prepared) => prepared,
                 Err(error) => {
                     let reason = error.root_cause().to_string();
@@ -380,7 +408,7 @@ fn serve(
         tokio::select! {
             () = beating => {}
             ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
-            () = door.run(context) => {}
+            () = callbacks.door.run(context) => {}
             () = admitting => tracing::error!("frontend ended by itself"),
             _ = stopped => {}
         }
@@ -393,7 +421,7 @@ async fn prepare(
     address: SocketAddr,
     config: &BrokerConfig,
     policy: Option<AccessPolicy>,
-    door: Door,
+    Callbacks { door, expelled }: Callbacks,
 ) -> rmqtt::Result<(
     MqttServer,
     Option<BrokerFrontend>,
@@ -435,7 +463,8 @@ async fn prepare(
         Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let frontend = BrokerFrontend::new(public, own, (policy, door.clone()), config);
+            let parts = (door.clone(), expelled);
+            let frontend = BrokerFrontend::new(public, own, (policy, parts), config);
             let principals = frontend.principals();
             SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters))
                 .install(&context)

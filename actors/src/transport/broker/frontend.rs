@@ -14,6 +14,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
+use ecod::model::names::NodeName;
 use rustls::pki_types::{CertificateDer, UnixTime};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -26,7 +27,9 @@ use super::backlog::Backlog;
 use super::byte_throttle::ByteThrottle;
 use super::client_rejection::ClientRejection;
 use super::connection_throttle::{ClientOrigin, ConnectionThrottle, LoginSlot};
+use super::departures::{Departures, is_distrust};
 use super::door::Door;
+use super::embedded::ExpulsionSink;
 use super::in_flight::InFlight;
 use super::permissions::AccessPolicy;
 use super::principal::{ConnectionQuota, Principal, PrincipalRegistry};
@@ -47,6 +50,8 @@ pub(super) struct BrokerFrontend {
 struct FrontendState {
     credentials: Option<Arc<Credentials>>,
     door: Door,
+    expelled: ExpulsionSink,
+    departures: Departures,
     principals: PrincipalRegistry,
     /// Address of rmqtt's own listener.
     backend: SocketAddr,
@@ -71,7 +76,7 @@ impl BrokerFrontend {
     pub(super) fn new(
         listener: TcpListener,
         backend: SocketAddr,
-        (policy, door): (&AccessPolicy, Door),
+        (policy, (door, expelled)): (&AccessPolicy, (Door, ExpulsionSink)),
         config: &BrokerConfig,
     ) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
@@ -82,6 +87,8 @@ impl BrokerFrontend {
         let shared = FrontendState {
             credentials: policy.credentials.clone(),
             door,
+            expelled,
+            departures: Departures::default(),
             principals: PrincipalRegistry::default(),
             backend,
             places: Arc::new(Semaphore::new(config.max_clients)),
@@ -127,7 +134,10 @@ impl BrokerFrontend {
                         sleep(ACCEPT_PAUSE).await;
                     }
                 },
-                () = self.reloaded() => self.recheck(),
+                () = self.reloaded() => {
+                    self.recheck();
+                    self.recheck_departed();
+                }
                 _ = rechecks.tick() => self.recheck(),
             }
         }
@@ -174,6 +184,18 @@ impl BrokerFrontend {
     fn recheck(&self) {
         if let (Some(sender), Some(credentials)) = (&self.current, &self.shared.credentials) {
             sender.send_replace(credentials.current());
+        }
+    }
+
+    /// Reports clients that have left and whose certificates are not trusted any more.
+    fn recheck_departed(&self) {
+        let shared = &self.shared;
+        if let Some(credentials) = &shared.credentials {
+            let verifier = Arc::clone(&credentials.current().clients);
+            let distrusted = shared.departures.take_distrusted(&*verifier, clock::now());
+            distrusted
+                .into_iter()
+                .for_each(|name| (shared.expelled)(name));
         }
     }
 }
@@ -253,9 +275,33 @@ impl FrontendState {
         backend.set_nodelay(true)?;
         backend.write_all(&connect.packet).await?;
         let _visit = slot.log_in();
-        tokio::select! {
+        let ended = tokio::select! {
             ended = self.limits.relay(stream, &wire_bytes, backend, &principal) => ended,
             error = certificate_invalidated(current, &certificates) => Err(ClientRejection::CertificateInvalidated(error)),
+        };
+        if let (Some(identity), Some(own)) = (&principal.identity, certificates.into_iter().next())
+        {
+            self.note_end(identity.name(), own, &ended);
+        }
+        ended
+    }
+
+    /// Reports a client that was disconnected because its certificate is not trusted any more, and
+    /// remembers one that has left.
+    fn note_end(
+        &self,
+        name: &NodeName,
+        certificate: CertificateDer<'static>,
+        ended: &Result<(), ClientRejection>,
+    ) {
+        match ended {
+            Err(ClientRejection::CertificateInvalidated(error)) if is_distrust(error) => {
+                (self.expelled)(name.clone());
+            }
+            Err(ClientRejection::CertificateInvalidated(_)) => {}
+            _ => self
+                .departures
+                .note(name.clone(), certificate, clock::now()),
         }
     }
 }

@@ -190,6 +190,10 @@ pub(super) const MAX_TOPIC_LEVELS: usize = 32;
 /// and sent to each new subscriber.
 const MAX_STATUS_BYTES: usize = 16 * 1024;
 
+/// Maximum payload of a description in bytes. Line feeds and quotes of its text take two bytes each
+/// in JSON; its other fields take a few hundred.
+const MAX_CELL_BYTES: usize = 2 * MAX_DESCRIPTION_BYTES + 1024;
+
 /// Maximum length of a topic or filter in bytes.
 const MAX_TOPIC_BYTES: usize = 512;
 
@@ -255,8 +259,7 @@ fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
         Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) => limits.payload_bytes,
         Topic::Nodes(_) => limits.payload_bytes.min(MAX_STATUS_BYTES),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
-        // Line feeds and quotes take two bytes each in JSON.
-        Topic::Cell => limits.map_bytes.min(2 * MAX_DESCRIPTION_BYTES),
+        Topic::Cell => limits.map_bytes.min(MAX_CELL_BYTES),
     }
 }
 
@@ -290,7 +293,9 @@ mod tests {
     use std::time::Duration;
 
     use ecod::model::names::NodeName;
-    use ecod::wire::Role;
+    use ecod::wire::{
+        CellDescription, ContentHash, Encoding, MAX_INTEGER, Role, SCHEMA_VERSION, encode,
+    };
 
     use super::*;
     use crate::platform::clock;
@@ -448,6 +453,27 @@ mod tests {
             allows("nodes/edge", MAX_STATUS_BYTES) && !allows("nodes/edge", MAX_STATUS_BYTES + 1)
         );
         assert!(allows("reputations", MAX_STATUS_BYTES + 1));
+    }
+
+    #[test]
+    fn a_description_of_line_feeds_alone_may_be_published() {
+        let mut permissions = permissions();
+        permissions.policy.limits = Limits::default();
+        let description = CellDescription {
+            schema: SCHEMA_VERSION,
+            version: MAX_INTEGER,
+            hash: ContentHash::default(),
+            set_by: NodeName::new("x".repeat(64)).unwrap(),
+            text: "\n".repeat(MAX_DESCRIPTION_BYTES),
+        };
+        for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
+            let bytes = encode(&description, encoding).len() + ENVELOPE_BYTES;
+            let edge = with(&identity("edge", Role::Edge));
+            assert!(
+                permissions.allows(&edge, "ecod/v1/lot/cell", true, bytes),
+                "{bytes} bytes in {encoding:?}"
+            );
+        }
     }
 
     #[test]

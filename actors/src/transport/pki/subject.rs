@@ -36,6 +36,12 @@ pub enum InvalidCertificate {
     Rights,
 }
 
+/// Remaining validity below which a certificate should be replaced.
+const RENEWAL_MARGIN: Duration = Duration::from_secs(30 * 86_400);
+
+/// The same for a certificate of the shortest validity: not later than its node stops leading.
+const LAST_RENEWAL_MARGIN: Duration = Duration::from_secs(60);
+
 impl CertificateSubject {
     /// Reads a certificate in DER.
     ///
@@ -123,6 +129,17 @@ impl CertificateSubject {
         } else {
             Rights::NONE
         }
+    }
+
+    /// The remaining validity if the certificate should be replaced: if it ends within 30 days, or
+    /// within a third of a shorter validity.
+    pub fn due_for_renewal(&self, now: Timestamp) -> Option<Duration> {
+        let validity = self.expires.since(self.begins);
+        let margin = RENEWAL_MARGIN
+            .min(validity / 3)
+            .max(LAST_RENEWAL_MARGIN.min(validity));
+        let left = self.expires.since(now);
+        (left < margin).then_some(left)
     }
 
     /// End of the certificate's validity.
