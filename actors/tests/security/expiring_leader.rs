@@ -6,12 +6,13 @@ use ecod::leadership::Position;
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use ecod_testkit::until;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep};
 
 use crate::fixture::{DAY, Pki, SOON, node as name};
-use crate::nodes::{aggregator, start_cell, start_with, until};
+use crate::nodes::{aggregator, start_cell, start_with};
 
 /// Longest time without a map on a machine that does much else: rounds follow each other in 0.1 s.
 const LONGEST_GAP: Duration = Duration::from_millis(350);

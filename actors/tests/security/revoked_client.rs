@@ -6,10 +6,11 @@ use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, encode};
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use ecod_testkit::until;
 use tokio::time::{Instant, interval, timeout};
 
 use crate::fixture::{Client, DAY, GONE_WITHIN, Pki, client_config, node as name};
-use crate::nodes::{start_with, until};
+use crate::nodes::start_with;
 
 /// True if the newest map has an object that only this vehicle has reported.
 fn shows(node: &NodeHandle, vehicle: &NodeName) -> bool {

@@ -251,6 +251,7 @@ impl LabelSet {
 }
 
 /// A report of one answer. Names are numbers, so that any text in a file is a valid name.
+#[expect(clippy::expect_used, reason = "the name is valid for every number")]
 fn report(item: usize, answer: Answer, seq: u64, at: Timestamp) -> ObjectReport {
     let label = format!("{:05}", answer.label);
     let object = PerceivedObject {
