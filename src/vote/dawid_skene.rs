@@ -64,12 +64,12 @@ impl VehicleEvidence {
 
 /// Right votes and all votes.
 #[derive(Debug, Clone, Copy, Default)]
-struct Tally {
+struct FleetVotes {
     right: f64,
     votes: f64,
 }
 
-impl Tally {
+impl FleetVotes {
     fn add(&mut self, right: f64, votes: f64) {
         self.right += right;
         self.votes += votes;
@@ -90,8 +90,8 @@ pub(super) struct DawidSkene {
     /// Weight of the confusion matrices, as of the last [`Self::refresh`].
     class_weight: f64,
     /// Fresh votes of the fleet, and fading votes that went stale.
-    live: Tally,
-    settled: Tally,
+    live: FleetVotes,
+    settled: FleetVotes,
     shares: ClassShares,
 }
 
@@ -400,7 +400,7 @@ impl DawidSkene {
 
     /// Clears all evidence that is not live.
     pub(super) fn clear_settled(&mut self) {
-        self.settled = Tally::default();
+        self.settled = FleetVotes::default();
         for evidence in &mut self.vehicles {
             evidence.settled = Confusion::default();
             evidence.inherited = Confusion::default();
@@ -409,7 +409,7 @@ impl DawidSkene {
 
     /// Clears all live evidence.
     pub(super) fn clear_live(&mut self) {
-        self.live = Tally::default();
+        self.live = FleetVotes::default();
         self.shares.clear();
         self.vehicles
             .iter_mut()

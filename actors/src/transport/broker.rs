@@ -27,8 +27,9 @@ use std::net::SocketAddr;
 
 #[cfg(fuzzing)]
 pub use connect_packet::read_connect_packet;
+pub use departures::ExpulsionSink;
 pub use door::{Door, DoorSetup};
-pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, ExpulsionSink, MqttBroker};
+pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
 pub use permissions::AccessPolicy;
 pub use principal::LeaderCheck;
 #[cfg(fuzzing)]

@@ -9,7 +9,7 @@ use ecod_actors::cli::{Failure, cell};
 use ecod_actors::platform::bounded_file;
 
 use super::columns::columns;
-use crate::eval::label_set::{Decision, Judgement, LabelSet};
+use crate::eval::label_set::{ItemVerdict, LabelSet, VerdictScores};
 
 /// Flags of `eval-labels`.
 #[derive(Debug, Args)]
@@ -91,7 +91,7 @@ fn read(path: &Path) -> Result<String, Failure> {
 }
 
 /// Accuracy and calibration of the majority and of VOTE.
-fn accuracy(set: &LabelSet, online: &[Judgement], refined: &[Judgement]) -> String {
+fn accuracy(set: &LabelSet, online: &[VerdictScores], refined: &[VerdictScores]) -> String {
     let header = [
         "method",
         "accuracy %",
@@ -106,8 +106,11 @@ fn accuracy(set: &LabelSet, online: &[Judgement], refined: &[Judgement]) -> Stri
     ];
     for (name, judged) in [("VOTE, one pass", online), ("VOTE, with passes", refined)] {
         let orders = judged.len() as f64;
-        let accuracies = judged.iter().map(|judgement| judgement.accuracy_pct);
-        let errors: f64 = judged.iter().map(|j| j.calibration_error_pct).sum();
+        let accuracies = judged.iter().map(|scores| scores.accuracy_pct);
+        let errors: f64 = judged
+            .iter()
+            .map(|scores| scores.calibration_error_pct)
+            .sum();
         rows.push(vec![
             name.to_owned(),
             format!("{:.2}", accuracies.clone().sum::<f64>() / orders),
@@ -120,9 +123,9 @@ fn accuracy(set: &LabelSet, online: &[Judgement], refined: &[Judgement]) -> Stri
 }
 
 /// How often verdicts after all passes are right, by their stated probability.
-fn reliability(judgement: &Judgement) -> String {
+fn reliability(scores: &VerdictScores) -> String {
     let mut rows = vec![["stated %", "items", "right %"].map(str::to_owned).to_vec()];
-    for (items, stated, right) in &judgement.reliability {
+    for (items, stated, right) in &scores.reliability {
         rows.push(vec![
             format!("{:.1}", 100.0 * stated),
             items.to_string(),
@@ -132,7 +135,7 @@ fn reliability(judgement: &Judgement) -> String {
     columns(&rows)
 }
 
-fn write(path: &Path, set: &LabelSet, decisions: &[Decision]) -> anyhow::Result<()> {
+fn write(path: &Path, set: &LabelSet, decisions: &[ItemVerdict]) -> anyhow::Result<()> {
     let cannot_write = || format!("cannot write {}", path.display());
     let mut writer = csv::Writer::from_path(path).with_context(cannot_write)?;
     writer.write_record(["item", "label", "probability", "truth"])?;

@@ -21,7 +21,7 @@ const BINS: usize = 10;
 
 /// One answer.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Answer {
+pub struct VoterAnswer {
     /// Index of the voter.
     pub voter: usize,
     /// Index of the label.
@@ -36,7 +36,7 @@ pub struct LabelledItem {
     /// Name in the file.
     pub name: String,
     /// At most one answer of each voter.
-    pub answers: Vec<Answer>,
+    pub answers: Vec<VoterAnswer>,
     /// Index of the true label, if it is known.
     pub truth: Option<usize>,
 }
@@ -99,7 +99,7 @@ pub struct LabelSet {
 
 /// The verdict about one item.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Decision {
+pub struct ItemVerdict {
     /// Index of the label.
     pub label: usize,
     /// Probability of the label according to the method.
@@ -108,7 +108,7 @@ pub struct Decision {
 
 /// How right the decisions of a method are.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Judgement {
+pub struct VerdictScores {
     /// Share of right decisions in percent of the items with a known truth.
     pub accuracy_pct: f64,
     /// Expected calibration error in percent: |mean probability − share of right decisions|, in ten
@@ -132,7 +132,7 @@ impl LabelSet {
     /// # Errors
     /// Returns a [`LabelSetError`] that names the first line or column that is wrong.
     pub fn parse(text: &str, truths: Option<&str>) -> Result<Self, LabelSetError> {
-        let mut reading = Reading::default();
+        let mut reading = LabelSetReader::default();
         reading.read_answers(text)?;
         if let Some(truths) = truths {
             reading.read_truths(truths)?;
@@ -171,14 +171,14 @@ impl LabelSet {
 
     /// Decisions of VOTE about all items: `online` item after item in the random order of `seed`,
     /// and after `passes` over all answers.
-    pub fn vote(&self, config: &WeightedConfig, seed: u64, passes: u32) -> [Vec<Decision>; 2] {
+    pub fn vote(&self, config: &WeightedConfig, seed: u64, passes: u32) -> [Vec<ItemVerdict>; 2] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut order: Vec<usize> = (0..self.items.len()).collect();
         order.shuffle(&mut rng);
         let mut vote = Vote::new(self.vote_config(config), Vec::new());
         let mut sequence = vec![0; self.voters.len()];
         let mut online = vec![
-            Decision {
+            ItemVerdict {
                 label: 0,
                 probability: 0.0
             };
@@ -218,7 +218,7 @@ impl LabelSet {
     }
 
     /// Compares decisions with the known truths.
-    pub fn judge(&self, decisions: &[Decision]) -> Judgement {
+    pub fn judge(&self, decisions: &[ItemVerdict]) -> VerdictScores {
         let mut bins = [(0, 0.0, 0.0); BINS];
         for (item, decision) in self.items.iter().zip(decisions) {
             let Some(truth) = item.truth else { continue };
@@ -238,7 +238,7 @@ impl LabelSet {
             let all = count as f64;
             (count, probability / all, right / all)
         };
-        Judgement {
+        VerdictScores {
             accuracy_pct: 100.0 * right / judged,
             calibration_error_pct: 100.0 * error / judged,
             reliability: bins
@@ -252,7 +252,7 @@ impl LabelSet {
 
 /// A report of one answer. Names are numbers, so that any text in a file is a valid name.
 #[expect(clippy::expect_used, reason = "the name is valid for every number")]
-fn report(item: usize, answer: Answer, seq: u64, at: Timestamp) -> ObjectReport {
+fn report(item: usize, answer: VoterAnswer, seq: u64, at: Timestamp) -> ObjectReport {
     let label = format!("{:05}", answer.label);
     let object = PerceivedObject {
         landmark: Some(format!("{item}").as_str().into()),
@@ -266,13 +266,13 @@ fn report(item: usize, answer: Answer, seq: u64, at: Timestamp) -> ObjectReport 
 }
 
 /// Stores verdicts as decisions, by the numbers in the names of [`report`].
-fn take(verdicts: &[Verdict], decisions: &mut [Decision]) {
+fn take(verdicts: &[Verdict], decisions: &mut [ItemVerdict]) {
     for verdict in verdicts {
         let item = verdict.landmark.as_str().parse::<usize>();
         let label = verdict.label.as_deref().map(str::parse::<usize>);
         if let (Ok(item), Some(Ok(label))) = (item, label) {
             let all: f64 = verdict.votes.values().sum();
-            decisions[item] = Decision {
+            decisions[item] = ItemVerdict {
                 label,
                 probability: verdict.score / all.max(f64::MIN_POSITIVE),
             };
@@ -282,16 +282,16 @@ fn take(verdicts: &[Verdict], decisions: &mut [Decision]) {
 
 /// A label set while it is read: names have numbers in the order of the file.
 #[derive(Default)]
-struct Reading {
+struct LabelSetReader {
     items: HashMap<String, usize>,
     voters: HashMap<String, usize>,
     labels: HashMap<String, usize>,
-    answers: Vec<BTreeMap<usize, Answer>>,
+    answers: Vec<BTreeMap<usize, VoterAnswer>>,
     truths: HashMap<usize, usize>,
     replaced: usize,
 }
 
-impl Reading {
+impl LabelSetReader {
     fn read_answers(&mut self, text: &str) -> Result<(), LabelSetError> {
         let table = Table::new(text)?;
         let item_column = table.column("item")?;
@@ -324,7 +324,7 @@ impl Reading {
                     })?,
             };
             self.answers.resize_with(self.items.len(), BTreeMap::new);
-            let answer = Answer {
+            let answer = VoterAnswer {
                 voter,
                 label,
                 confidence,
@@ -391,7 +391,7 @@ impl Reading {
             name: name.to_owned(),
             answers: self.answers[index]
                 .values()
-                .map(|answer| Answer {
+                .map(|answer| VoterAnswer {
                     label: number[answer.label],
                     ..*answer
                 })

@@ -2,7 +2,7 @@
 //! certificates are revoked.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use ecod::model::names::NodeName;
@@ -10,6 +10,10 @@ use ecod::model::time::Timestamp;
 use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::server::danger::ClientCertVerifier;
 use rustls::{CertificateError, Error};
+
+/// Callback with the name in the certificate of a present or recent client, when the certificate is
+/// not trusted any more, for example because it was revoked. It must not block.
+pub type ExpulsionSink = Arc<dyn Fn(NodeName) + Send + Sync>;
 
 /// Time for which a client that has left is kept: objects are published for at most this time after
 /// their last detection.

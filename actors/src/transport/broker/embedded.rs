@@ -8,7 +8,6 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::model::names::NodeName;
 use rmqtt::context::ServerContext;
 use rmqtt::net::{Builder, Listener};
 use rmqtt::server::MqttServer;
@@ -18,6 +17,7 @@ use tokio::runtime;
 use tokio::sync::oneshot;
 
 use super::BrokerHealth;
+use super::departures::ExpulsionSink;
 use super::door::{Door, DoorHooks};
 use super::frontend::BrokerFrontend;
 use super::heartbeat::{HEARTBEAT_INTERVAL, ThreadHeartbeat};
@@ -186,10 +186,6 @@ impl BrokerConfig {
         check_range("max_messages_hz", f64::from(self.max_messages_hz), 1.0, 1e6)
     }
 }
-
-/// Callback with the name in the certificate of a present or recent client, when the certificate is
-/// not trusted any more, for example because it was revoked. It must not block.
-pub type ExpulsionSink = Arc<dyn Fn(NodeName) + Send + Sync>;
 
 /// rmqtt as a library, on one thread, with retained messages in memory.
 pub struct EmbeddedBroker {
