@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -69,6 +69,10 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
+
+compare-labels: PACKAGES += python3-venv
+compare-labels: setup ## VOTE beside the methods of crowd-kit, from PyPI, on label sets; SETS=DIR
+	packaging/compare-labels "$(SETS)"
 
 eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 	cargo test --release --locked -p ecod --test core vote::generated:: -- --include-ignored --nocapture
