@@ -1,6 +1,6 @@
 """Accuracy in percent of crowd-kit's methods and of `ecod-lab eval-labels` on the same label sets, as a table in Markdown.
 
-A tie of the majority counts as the chance of drawing the right label. The mean column is over all sets, the last rows count the
+A tie of the majority counts as the chance of drawing the right label. The row of means is over all sets, the last rows count the
 sets on which a method is at most half a point below the best of the table, and more than half a point below the majority.
 """
 
@@ -19,14 +19,14 @@ METHODS = {
     "MACE": lambda: MACE(n_restarts=3, n_iter=30, random_state=1),
     "GLAD": lambda: GLAD(n_iter=30),
 }
-OURS = {"majority": "majority", "VOTE, one pass": "VOTE, one pass", "VOTE, with passes": "VOTE, with passes"}
+OURS = ["majority", "VOTE, one pass", "VOTE, with passes"]
 
 
 def ours(lab, folder):
     """Accuracies by the rows that `eval-labels` prints."""
     command = [lab, "eval-labels", folder / "label.csv", "--truth", folder / "truth.csv"]
     text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return {name: float(re.search(rf"^{name} +([0-9.]+)", text, re.M).group(1)) for name in OURS.values()}
+    return {name: float(re.search(rf"^{name} +([0-9.]+)", text, re.M).group(1)) for name in OURS}
 
 
 def crowdkit(folder):

@@ -401,6 +401,7 @@ impl DawidSkene {
     /// Clears all evidence that is not live.
     pub(super) fn clear_settled(&mut self) {
         self.settled = FleetVotes::default();
+        self.label_bias.clear_inherited();
         for evidence in &mut self.vehicles {
             evidence.settled = Confusion::default();
             evidence.inherited = Confusion::default();

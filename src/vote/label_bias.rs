@@ -2,15 +2,19 @@
 //! confusion matrix of each vehicle.
 //!
 //! Whether a vehicle is right equally often on every class, or on some classes more often, cannot
-//! be read from estimates of the truth: a model with classes fits votes better even if its classes
-//! are not the true ones. A difference between vehicles that answer about the same landmarks needs
-//! no truth. The bias of a vehicle towards a label is the mean of [it states the label] − (share of
-//! the label among the other votes on the landmark). Its variance between vehicles is estimated by
-//! the method of moments without the part that chance explains (random effects; DerSimonian & Laird
-//! 1986), and divided by the label's share and summed over labels, which makes it Pearson's φ² of
-//! vehicles and labels. The weight of confusion matrices is 1 − (φ₀/φ)⁴, at least 0. It is the
-//! positive-part shrinkage of James & Stein (1961) of φ², and close to a choice between two models
-//! without its jump.
+//! be read from verdicts: a model with classes can predict votes better even if its classes are not
+//! the true ones. A difference between vehicles that vote on the same landmarks needs no verdict.
+//! The bias of a vehicle towards a label is the mean of [it states the label] − (share of the label
+//! among the other votes on the landmark). Its variance between vehicles is estimated by the method
+//! of moments without the part that chance explains (random effects; DerSimonian & Laird 1986),
+//! divided by the label's share and summed over labels. The result resembles Pearson's φ² of
+//! vehicles and labels; it is larger where few vote on a landmark. The weight of confusion matrices
+//! is 1 − (φ₀/φ)⁴, at least 0. The form is that of James & Stein's (1961) positive-part shrinkage;
+//! the weight rises steeply above φ₀, but without a jump.
+//!
+//! Votes count as independent, also repeated ones on a landmark that stays: a vehicle that misreads
+//! one landmark for long has a bias. What a ledger says about vehicles counts, too; it comes from
+//! verdicts.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -29,11 +33,15 @@ struct Preferences {
     labels: BTreeMap<LabelIndex, LabelSums>,
 }
 
+/// Least sum of shares that is kept.
+const MIN_SHARE: f64 = 1e-6;
+
 /// Sums over a vehicle's votes on landmarks where it or another stated a label.
 #[derive(Debug, Clone, Copy, Default)]
 struct LabelSums {
-    /// Votes for the label.
-    stated: f64,
+    /// Shares of the label, each the mean of the vehicle's own vote (0 or 1) and of the others'
+    /// share.
+    share: f64,
     /// Deviations of its votes from the share of the others' votes.
     deviation: f64,
     /// Squares of the deviations.
@@ -45,7 +53,7 @@ impl Preferences {
     fn add(&mut self, label: LabelIndex, own: f64, share_of_others: f64) {
         let sums = self.labels.entry(label).or_default();
         let deviation = own - share_of_others;
-        sums.stated += own;
+        sums.share += (own + share_of_others) / 2.0;
         sums.deviation += deviation;
         sums.squares += deviation * deviation;
     }
@@ -54,10 +62,11 @@ impl Preferences {
         self.votes *= factor;
         self.squares *= factor * factor;
         for sums in self.labels.values_mut() {
-            sums.stated *= factor;
+            sums.share *= factor;
             sums.deviation *= factor;
             sums.squares *= factor * factor;
         }
+        self.labels.retain(|_, sums| sums.share > MIN_SHARE);
     }
 
     /// The mean square of the vehicle's bias towards a label, times its votes: chance cancels in the
@@ -118,6 +127,9 @@ impl LabelBias {
             }
             let preferences = &mut self.vehicles[vehicle];
             preferences.fade(fade);
+            if let Some(inherited) = self.inherited.get_mut(vehicle) {
+                inherited.fade(fade);
+            }
             preferences.votes += 1.0;
             preferences.squares += 1.0;
             for (&label, &count) in &stated {
@@ -140,7 +152,7 @@ impl LabelBias {
         let of_label = |&(label, right, wrong): &(LabelIndex, f64, f64)| {
             let missed = (incorrect - wrong) / others;
             let sums = LabelSums {
-                stated: right + wrong,
+                share: right + (wrong + missed) / 2.0,
                 deviation: wrong - missed,
                 squares: wrong + missed,
             };
@@ -169,6 +181,7 @@ impl LabelBias {
                 }
             }
         }
+        self.since = self.since.max(self.read);
     }
 
     /// Removes labels, whose indices may be reused.
@@ -178,6 +191,7 @@ impl LabelBias {
                 .labels
                 .retain(|label, _| !labels.contains(label));
         }
+        self.since = self.since.max(self.read);
     }
 
     /// Weight, 0 to 1, of a vehicle's confusion matrix against one accuracy for all classes. It is
@@ -193,22 +207,78 @@ impl LabelBias {
 
     fn phi_squared(&mut self) -> f64 {
         let mut read = 0;
-        // Votes for each label, and the variance of the bias towards it.
+        // Sums of the shares of each label, and of the variances of the bias towards it.
         let mut labels: BTreeMap<LabelIndex, (f64, f64)> = BTreeMap::new();
         for preferences in self.vehicles.iter().chain(&self.inherited) {
             read += preferences.labels.len();
             for (&label, &sums) in &preferences.labels {
-                let (stated, variance) = labels.entry(label).or_default();
-                *stated += sums.stated;
+                let (share, variance) = labels.entry(label).or_default();
+                *share += sums.share;
                 *variance += preferences.weighted_variance(sums);
             }
         }
         self.read = read;
-        // The share of a label is `stated / votes`, the variance of a bias `variance / votes`.
+        // Both are sums over the same votes, so that the number of votes cancels.
         labels
             .values()
-            .filter(|(stated, _)| *stated > 0.0)
-            .map(|(stated, variance)| variance / stated)
+            .filter(|(share, _)| *share > MIN_SHARE)
+            .map(|(share, variance)| variance / share)
             .sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MEMORY_VOTES: f64 = 500.0;
+
+    /// Counts a landmark with the votes of the vehicles 0, 1, 2, …
+    fn compare(bias: &mut LabelBias, labels: &[LabelIndex]) {
+        let votes: Vec<_> = labels
+            .iter()
+            .enumerate()
+            .map(|(vehicle, &label)| (vehicle, label, true))
+            .collect();
+        bias.compare(&votes);
+    }
+
+    #[test]
+    fn errors_that_all_make_alike_are_no_reason_for_matrices() {
+        let mut bias = LabelBias::new(MEMORY_VOTES);
+        for landmark in 0..400u16 {
+            let truth = landmark % 2;
+            let votes: Vec<_> = (0..5)
+                .map(|vehicle| truth * u16::from((landmark / 2 + 7 * vehicle) % 4 != 0))
+                .collect();
+            compare(&mut bias, &votes);
+        }
+        assert!(bias.class_weight() < 0.1, "{}", bias.class_weight());
+    }
+
+    #[test]
+    fn opposite_preferences_are_a_reason_for_matrices() {
+        let mut bias = LabelBias::new(MEMORY_VOTES);
+        for landmark in 0..400u16 {
+            let truth = landmark % 2;
+            let is_hard = (landmark / 2) % 2 == 0;
+            let likes = |label| if is_hard { label } else { truth };
+            compare(&mut bias, &[likes(0), likes(1), truth, likes(0), likes(1)]);
+        }
+        assert!(bias.class_weight() > 0.9, "{}", bias.class_weight());
+    }
+
+    #[test]
+    fn vehicles_that_fall_silent_leave_no_bias_behind() {
+        let mut bias = LabelBias::new(MEMORY_VOTES);
+        for landmark in 0..300u16 {
+            let truth = landmark % 2;
+            let first = if landmark % 100 == 0 { 2 } else { truth };
+            compare(&mut bias, &[first, truth, truth]);
+        }
+        for landmark in 0..8000u16 {
+            bias.compare(&[(0, landmark % 2, true), (1, landmark % 2, false)]);
+        }
+        assert!(bias.class_weight() < 0.1, "{}", bias.class_weight());
     }
 }

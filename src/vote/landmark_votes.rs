@@ -134,8 +134,8 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Counts new votes as evidence on dependence, label bias and confidences; where there are many voters,
-    /// `order` decides which pairs are compared.
+    /// Counts new votes as evidence on dependence, label bias and confidences; where there are many
+    /// voters, `order` decides which pairs are compared.
     pub(super) fn compare(
         &mut self,
         dependence: &mut Dependence,

@@ -26,7 +26,7 @@ pub struct VoterAnswer {
     pub voter: usize,
     /// Index of the label.
     pub label: usize,
-    /// Stated confidence, 0 to 1.
+    /// Stated confidence, above 0 and up to 1.
     pub confidence: f64,
 }
 
@@ -52,8 +52,8 @@ pub enum LabelSetError {
         "there is no column {0}; the columns are item, voter, label and perhaps confidence and truth"
     )]
     NoColumn(&'static str),
-    /// A confidence is no number from 0 to 1.
-    #[error("line {line}: confidence {text:?} is no number from 0 to 1")]
+    /// A confidence is no number from 0 to 1, or 0, with which an answer is no vote.
+    #[error("line {line}: confidence {text:?} is no number above 0 and up to 1")]
     Confidence {
         /// Line of the file, from 1.
         line: u64,
@@ -317,7 +317,7 @@ impl LabelSetReader {
                 Some(text) => text
                     .parse()
                     .ok()
-                    .filter(|confidence| (0.0..=1.0).contains(confidence))
+                    .filter(|confidence| (0.0..=1.0).contains(confidence) && *confidence > 0.0)
                     .ok_or_else(|| LabelSetError::Confidence {
                         line,
                         text: text.to_owned(),
@@ -493,7 +493,7 @@ mod tests {
         );
         assert_eq!(
             error("item,voter,label,confidence\nx,a,cup,1\nx,b,cup,2\n"),
-            "line 3: confidence \"2\" is no number from 0 to 1"
+            "line 3: confidence \"2\" is no number above 0 and up to 1"
         );
         assert_eq!(
             error("item,voter,label,truth\nx,a,cup,cup\nx,b,cup,mouse\n"),

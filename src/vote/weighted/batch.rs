@@ -38,6 +38,7 @@ impl WeightedVoting {
         (0..passes).for_each(|_| self.judge_together());
         self.dependence = dependence;
         self.model.label_bias = label_bias;
+        self.model.refresh(std::iter::empty());
         let calibration = std::mem::replace(&mut self.calibration, settled);
         self.calibration.take_live(calibration);
     }
@@ -72,9 +73,9 @@ impl WeightedVoting {
     /// Replaces all live evidence by the evidence from the weighted majorities; all landmarks are
     /// evaluated when the round closes.
     pub(super) fn start_again(&mut self) {
-        let weights = self.calibration.weights();
         self.model.clear_live();
         self.calibration.clear_live();
+        let weights = self.calibration.weights();
         for (landmark, landmark_votes) in &mut self.landmarks {
             self.changed.insert(landmark.clone());
             landmark_votes.published = None;
