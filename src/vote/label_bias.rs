@@ -13,8 +13,7 @@
 //! the weight rises steeply above φ₀, but without a jump.
 //!
 //! Votes count as independent, also repeated ones on a landmark that stays: a vehicle that misreads
-//! one landmark for long has a bias. What a ledger says about vehicles counts, too; it comes from
-//! verdicts.
+//! one landmark for long has a bias. The counts of a ledger enter, too; they come from verdicts.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -88,7 +87,7 @@ pub(super) struct LabelBias {
     memory_votes: f64,
     /// By index of the vehicle.
     vehicles: Vec<Preferences>,
-    /// The same by the ledger of other aggregators.
+    /// Preferences according to the ledger of other aggregators, by index of the vehicle.
     inherited: Vec<Preferences>,
     /// Votes since [`Self::class_weight`] was last computed, and sums that it then read.
     since: usize,
@@ -140,7 +139,7 @@ impl LabelBias {
         }
     }
 
-    /// Replaces what a ledger says about a vehicle: right and wrong votes by stated label. The
+    /// Replaces the counts of a ledger about a vehicle: right and wrong votes by stated label. The
     /// truth behind a wrong vote is any other label with equal probability.
     pub(super) fn inherit(&mut self, vehicle: usize, labels: &[(LabelIndex, f64, f64)]) {
         if self.inherited.len() <= vehicle {
@@ -166,7 +165,7 @@ impl LabelBias {
         self.since = self.since.max(self.read);
     }
 
-    /// Clears what ledgers say.
+    /// Removes the counts of ledgers.
     pub(super) fn clear_inherited(&mut self) {
         self.inherited.clear();
         self.since = self.since.max(self.read);

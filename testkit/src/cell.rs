@@ -73,7 +73,7 @@ impl Cell {
         self.start_with(self.config(name, role)).await;
     }
 
-    /// The same with another configuration.
+    /// Starts a node of this configuration on a runtime of its own.
     ///
     /// # Panics
     /// Panics if the node does not start.

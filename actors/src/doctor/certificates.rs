@@ -1,8 +1,9 @@
 //! Checks of the node's certificates and their expiry, in its own cell and in the cells to which it
 //! moves.
 
-use rustls::pki_types::UnixTime;
 use std::os::unix::fs::PermissionsExt;
+
+use rustls::pki_types::UnixTime;
 
 use super::Finding;
 use crate::node::config::{CellEntry, NodeConfig};

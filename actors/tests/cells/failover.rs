@@ -136,7 +136,7 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
     for (name, path) in [("euclid", &first), ("gauss", &second)] {
         let mut config = cell.config(name, Role::Auto);
         config.mqtt.broker = Some(path.address.into());
-        // The protocol's own signs of life tell nothing in here.
+        // Without signs of life, only rounds can show the failure.
         config.mqtt.keep_alive_s = 600;
         cell.start_with(config).await;
     }

@@ -53,7 +53,7 @@ const CONFIGURATIONS: &[&str] = &[
     "[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"slot-0\"\nx_m = 3\ny_m = 0",
 ];
 
-/// The same of cameras.
+/// Camera configurations that a node refuses.
 const CAMERAS: &[&str] = &[
     "[camera]",
     "[camera]\nsource = { kind = \"film\" }\ndetector = { kind = \"placard\" }",

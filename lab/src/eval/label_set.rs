@@ -37,7 +37,7 @@ pub struct LabelledItem {
     pub name: String,
     /// At most one answer of each voter.
     pub answers: Vec<VoterAnswer>,
-    /// Index of the true label, if it is known.
+    /// Index of the true label, if the file has one.
     pub truth: Option<usize>,
 }
 
@@ -109,7 +109,7 @@ pub struct ItemVerdict {
 /// How right the decisions of a method are.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VerdictScores {
-    /// Share of right decisions in percent of the items with a known truth.
+    /// Share of right decisions in percent of the items that have a truth.
     pub accuracy_pct: f64,
     /// Expected calibration error in percent: |mean probability − share of right decisions|, in ten
     /// bins of probability.
@@ -140,7 +140,7 @@ impl LabelSet {
         reading.finish()
     }
 
-    /// Items with a known truth.
+    /// Number of items that have a truth.
     pub fn judged_items(&self) -> usize {
         self.items
             .iter()
@@ -217,7 +217,7 @@ impl LabelSet {
         }
     }
 
-    /// Compares decisions with the known truths.
+    /// Accuracy and calibration of decisions about all items.
     pub fn judge(&self, decisions: &[ItemVerdict]) -> VerdictScores {
         let mut bins = [(0, 0.0, 0.0); BINS];
         for (item, decision) in self.items.iter().zip(decisions) {

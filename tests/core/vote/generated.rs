@@ -22,7 +22,7 @@ const TOLERANCE: f64 = 0.5;
 const SETS: u64 = 200;
 const PASSES: u32 = 30;
 /// Sets that fall short: a quarter of the annotators copies, always states one class, or some do each, and few votes of each
-/// annotator tell them from good ones.
+/// annotator distinguish them from good ones.
 const KNOWN_SHORT: [u64; 13] = [22, 24, 72, 80, 82, 132, 134, 135, 136, 161, 162, 164, 198];
 
 /// A sum of differences of items.

@@ -80,8 +80,8 @@ impl Departures {
     }
 }
 
-/// True if a certificate is invalid for another reason than its time: a node whose certificate has
-/// merely expired was trusted until then.
+/// True if a certificate is invalid for another reason than its time. Reports that a node made
+/// before its certificate expired stay valid.
 pub(super) fn is_distrust(error: &Error) -> bool {
     use CertificateError::{Expired, ExpiredContext, NotValidYet, NotValidYetContext};
     !matches!(

@@ -272,14 +272,7 @@ impl MqttBroker for EmbeddedBroker {
         let thread = thread::Builder::new()
             .name("mqtt-broker".to_owned())
             .spawn(move || {
-                serve(
-                    address,
-                    &config,
-                    (policy, callbacks),
-                    &beats,
-                    &ready,
-                    stopped,
-                );
+                serve(address, &config, policy, callbacks, &beats, &ready, stopped);
                 drop::<mpsc::Sender<()>>(ending);
             })
             .map_err(thread_error)?;
@@ -362,7 +355,8 @@ struct Callbacks {
 fn serve(
     address: SocketAddr,
     config: &BrokerConfig,
-    (policy, callbacks): (Option<AccessPolicy>, Callbacks),
+    policy: Option<AccessPolicy>,
+    callbacks: Callbacks,
     beats: &AtomicU64,
     ready: &mpsc::Sender<Result<SocketAddr, BrokerError>>,
     stopped: oneshot::Receiver<()>,
@@ -459,8 +453,7 @@ async fn prepare(
         Some(policy) => {
             let public = TcpListener::bind(address).await?;
             let bound = public.local_addr()?;
-            let parts = (door.clone(), expelled);
-            let frontend = BrokerFrontend::new(public, own, (policy, parts), config);
+            let frontend = BrokerFrontend::new(public, own, policy, door.clone(), expelled, config);
             let principals = frontend.principals();
             SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters))
                 .install(&context)

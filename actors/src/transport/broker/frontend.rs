@@ -75,7 +75,9 @@ impl BrokerFrontend {
     pub(super) fn new(
         listener: TcpListener,
         backend: SocketAddr,
-        (policy, (door, expelled)): (&AccessPolicy, (Door, ExpulsionSink)),
+        policy: &AccessPolicy,
+        door: Door,
+        expelled: ExpulsionSink,
         config: &BrokerConfig,
     ) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
@@ -286,7 +288,7 @@ impl FrontendState {
     }
 
     /// Reports a client that was disconnected because its certificate is not trusted any more, and
-    /// remembers one that has left.
+    /// records any other client that has left.
     fn note_end(
         &self,
         name: &NodeName,
