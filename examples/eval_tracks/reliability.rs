@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use ecod_lab::eval::tracks::{ReliabilityBin, ReliabilityBins};
+use ecod_lab::eval::ReliabilityBin;
+use ecod_lab::eval::tracks::ReliabilityBins;
 use plotters::prelude::*;
 
 /// The scenes that are drawn, by name.

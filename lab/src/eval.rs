@@ -12,6 +12,7 @@
 pub mod baselines;
 pub mod formats;
 pub mod label_set;
+mod reliability;
 pub mod tracks;
 mod truth;
 mod votes;
@@ -25,6 +26,7 @@ use ecod::replay::FusedLine;
 use ecod::wire::{ObjectReport, ReportKind};
 use serde::Serialize;
 
+pub use reliability::{Reliability, ReliabilityBin};
 pub use truth::{Truth, TruthError};
 pub use votes::VehicleScores;
 

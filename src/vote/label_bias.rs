@@ -80,6 +80,14 @@ impl Preferences {
     }
 }
 
+/// A vehicle's right and wrong votes for one label, according to a ledger.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LabelRecord {
+    pub(super) label: LabelIndex,
+    pub(super) right: f64,
+    pub(super) wrong: f64,
+}
+
 /// The preferences of all vehicles.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LabelBias {
@@ -141,26 +149,26 @@ impl LabelBias {
 
     /// Replaces the counts of a ledger about a vehicle: right and wrong votes by stated label. The
     /// truth behind a wrong vote is any other label with equal probability.
-    pub(super) fn inherit(&mut self, vehicle: usize, labels: &[(LabelIndex, f64, f64)]) {
+    pub(super) fn inherit(&mut self, vehicle: usize, records: &[LabelRecord]) {
         if self.inherited.len() <= vehicle {
             self.inherited.resize(vehicle + 1, Preferences::default());
         }
-        let votes: f64 = labels.iter().map(|(_, right, wrong)| right + wrong).sum();
-        let incorrect: f64 = labels.iter().map(|(.., wrong)| wrong).sum();
-        let others = labels.len().saturating_sub(1).max(1) as f64;
-        let of_label = |&(label, right, wrong): &(LabelIndex, f64, f64)| {
-            let missed = (incorrect - wrong) / others;
+        let incorrect: f64 = records.iter().map(|record| record.wrong).sum();
+        let votes = incorrect + records.iter().map(|record| record.right).sum::<f64>();
+        let others = records.len().saturating_sub(1).max(1) as f64;
+        let sums_of = |record: &LabelRecord| {
+            let missed = (incorrect - record.wrong) / others;
             let sums = LabelSums {
-                share: right + (wrong + missed) / 2.0,
-                deviation: wrong - missed,
-                squares: wrong + missed,
+                share: record.right + (record.wrong + missed) / 2.0,
+                deviation: record.wrong - missed,
+                squares: record.wrong + missed,
             };
-            (label, sums)
+            (record.label, sums)
         };
         self.inherited[vehicle] = Preferences {
             votes,
             squares: votes,
-            labels: labels.iter().map(of_label).collect(),
+            labels: records.iter().map(sums_of).collect(),
         };
         self.since = self.since.max(self.read);
     }

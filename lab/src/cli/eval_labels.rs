@@ -10,6 +10,7 @@ use ecod_actors::platform::bounded_file;
 
 use super::columns::columns;
 use crate::eval::label_set::{ItemVerdict, LabelSet, VerdictScores};
+use crate::report::tracks::reliability;
 
 /// Flags of `eval-labels`.
 #[derive(Debug, Args)]
@@ -74,7 +75,8 @@ pub(super) fn run(arguments: &EvalLabelsArguments) -> Result<(), Failure> {
     if set.judged_items() > 0 {
         print!("\n{}", accuracy(&set, &online, &refined));
         if let Some(of_last) = refined.last() {
-            print!("\n{}", reliability(of_last));
+            let rows = reliability("after passes", &of_last.reliability);
+            print!("\n{}", columns(&rows));
         }
     }
     if let Some(out) = &arguments.out {
@@ -109,7 +111,7 @@ fn accuracy(set: &LabelSet, online: &[VerdictScores], refined: &[VerdictScores])
         let accuracies = judged.iter().map(|scores| scores.accuracy_pct);
         let errors: f64 = judged
             .iter()
-            .map(|scores| scores.calibration_error_pct)
+            .filter_map(|scores| scores.reliability.ece_pct)
             .sum();
         rows.push(vec![
             name.to_owned(),
@@ -117,19 +119,6 @@ fn accuracy(set: &LabelSet, online: &[VerdictScores], refined: &[VerdictScores])
             format!("{:.2}", accuracies.clone().fold(f64::INFINITY, f64::min)),
             format!("{:.2}", accuracies.fold(0.0, f64::max)),
             format!("{:.1}", errors / orders),
-        ]);
-    }
-    columns(&rows)
-}
-
-/// How often verdicts after all passes are right, by their stated probability.
-fn reliability(scores: &VerdictScores) -> String {
-    let mut rows = vec![["stated %", "items", "right %"].map(str::to_owned).to_vec()];
-    for (items, stated, right) in &scores.reliability {
-        rows.push(vec![
-            format!("{:.1}", 100.0 * stated),
-            items.to_string(),
-            format!("{:.1}", 100.0 * right),
         ]);
     }
     columns(&rows)

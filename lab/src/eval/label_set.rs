@@ -14,10 +14,10 @@ use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
+use super::reliability::{JudgedStatement, Reliability};
+
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 const ROUND: Duration = Duration::from_millis(100);
-/// Bins of a reliability diagram.
-const BINS: usize = 10;
 
 /// One answer.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -111,11 +111,8 @@ pub struct ItemVerdict {
 pub struct VerdictScores {
     /// Share of right decisions in percent of the items that have a truth.
     pub accuracy_pct: f64,
-    /// Expected calibration error in percent: |mean probability − share of right decisions|, in ten
-    /// bins of probability.
-    pub calibration_error_pct: f64,
-    /// Decisions, mean probability and share of right decisions in each bin that has any.
-    pub reliability: Vec<(usize, f64, f64)>,
+    /// How often decisions are right, by their stated probability.
+    pub reliability: Reliability,
 }
 
 fn position(names: &mut HashMap<String, usize>, name: &str) -> usize {
@@ -219,33 +216,21 @@ impl LabelSet {
 
     /// Accuracy and calibration of decisions about all items.
     pub fn judge(&self, decisions: &[ItemVerdict]) -> VerdictScores {
-        let mut bins = [(0, 0.0, 0.0); BINS];
-        for (item, decision) in self.items.iter().zip(decisions) {
-            let Some(truth) = item.truth else { continue };
-            let bin = ((decision.probability * BINS as f64) as usize).min(BINS - 1);
-            let (count, probability, right) = &mut bins[bin];
-            *count += 1;
-            *probability += decision.probability;
-            *right += f64::from(u8::from(decision.label == truth));
-        }
-        let judged = self.judged_items().max(1) as f64;
-        let right: f64 = bins.iter().map(|(.., right)| right).sum();
-        let error: f64 = bins
+        let judged: Vec<JudgedStatement> = self
+            .items
             .iter()
-            .map(|(_, probability, right)| (probability - right).abs())
-            .sum();
-        let means = |&(count, probability, right): &(usize, f64, f64)| {
-            let all = count as f64;
-            (count, probability / all, right / all)
-        };
+            .zip(decisions)
+            .filter_map(|(item, decision)| {
+                Some(JudgedStatement {
+                    stated: decision.probability,
+                    is_right: decision.label == item.truth?,
+                })
+            })
+            .collect();
+        let right = judged.iter().filter(|statement| statement.is_right).count();
         VerdictScores {
-            accuracy_pct: 100.0 * right / judged,
-            calibration_error_pct: 100.0 * error / judged,
-            reliability: bins
-                .iter()
-                .filter(|(count, ..)| *count > 0)
-                .map(means)
-                .collect(),
+            accuracy_pct: 100.0 * right as f64 / judged.len().max(1) as f64,
+            reliability: Reliability::of(judged),
         }
     }
 }

@@ -30,7 +30,7 @@ use nalgebra::Point2;
 use serde::Serialize;
 use uuid::Uuid;
 
-pub use calibration::{Reliability, ReliabilityBin, ReliabilityBins};
+pub use calibration::ReliabilityBins;
 pub use truth::{TrackTruth, TrackTruthError};
 
 use super::formats::{Sequence, time_of};

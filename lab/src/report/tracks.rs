@@ -1,6 +1,7 @@
 //! Figures of objects that move, as rows for pages and terminals.
 
-use crate::eval::tracks::{AP_DISTANCES_M, Reliability, ThresholdScores, TrackScores};
+use crate::eval::Reliability;
+use crate::eval::tracks::{AP_DISTANCES_M, ThresholdScores, TrackScores};
 
 /// Headings of the figures at a threshold, in the order of [`at`].
 const AT_THRESHOLD: [&str; 13] = [
@@ -67,7 +68,7 @@ pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
 }
 
 /// One row for each bin of a reliability diagram, the expected calibration error last.
-fn reliability(name: &str, of: &Reliability) -> Vec<Vec<String>> {
+pub(crate) fn reliability(name: &str, of: &Reliability) -> Vec<Vec<String>> {
     let mut rows = vec![
         [name, "stated %", "right %", "objects"]
             .map(str::to_owned)

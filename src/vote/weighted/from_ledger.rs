@@ -8,6 +8,7 @@ use crate::model::names::{Label, NodeName};
 use crate::reputation::{RememberedVotes, ReputationLedger};
 use crate::vote::config::VoteConfig;
 use crate::vote::confusion::{Confusion, LabelIndex};
+use crate::vote::label_bias::LabelRecord;
 
 impl WeightedVoting {
     /// Takes over the ledger's kept votes except those that were counted here: a standby has
@@ -46,18 +47,28 @@ impl WeightedVoting {
         self.model.label_bias.clear_inherited();
         for (node, labels) in known {
             let mut inherited = Confusion::default();
-            let labels: Vec<(LabelIndex, f64, f64)> = labels
+            let records: Vec<LabelRecord> = labels
                 .into_iter()
-                .filter_map(|(label, (correct, incorrect))| {
-                    Some((self.labels.index(&label)?, correct, incorrect))
+                .filter_map(|(label, (right, wrong))| {
+                    let label = self.labels.index(&label)?;
+                    Some(LabelRecord {
+                        label,
+                        right,
+                        wrong,
+                    })
                 })
                 .collect();
-            for &(label, correct, incorrect) in &labels {
-                inherited.add(label, label, correct);
+            for &LabelRecord {
+                label,
+                right,
+                wrong,
+            } in &records
+            {
+                inherited.add(label, label, right);
                 let others: Vec<_> = (0..self.labels.len() as LabelIndex)
                     .filter(|l| *l != label)
                     .collect();
-                let each = incorrect / others.len().max(1) as f64;
+                let each = wrong / others.len().max(1) as f64;
                 if each > 0.0 {
                     others
                         .into_iter()
@@ -65,7 +76,7 @@ impl WeightedVoting {
                 }
             }
             let vehicle = self.vehicle(&node);
-            self.model.label_bias.inherit(vehicle, &labels);
+            self.model.label_bias.inherit(vehicle, &records);
             self.model.vehicles[vehicle].inherited = inherited;
         }
     }
