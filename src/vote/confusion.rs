@@ -1,8 +1,6 @@
 //! Confusion counts: how often each label was stated where each was true.
 
-use std::collections::BTreeSet;
-
-use hashbrown::HashMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
@@ -14,8 +12,8 @@ const MIN_SCALE: f64 = 1e-60;
 /// All counts share one scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
-    cells: HashMap<(LabelIndex, LabelIndex), f64>,
-    rows: HashMap<LabelIndex, f64>,
+    cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
+    rows: BTreeMap<LabelIndex, f64>,
     correct: f64,
     total: f64,
     scale: f64,
@@ -24,8 +22,8 @@ pub(super) struct Confusion {
 impl Default for Confusion {
     fn default() -> Self {
         Self {
-            cells: HashMap::new(),
-            rows: HashMap::new(),
+            cells: BTreeMap::new(),
+            rows: BTreeMap::new(),
             correct: 0.0,
             total: 0.0,
             scale: 1.0,
@@ -53,14 +51,12 @@ impl Confusion {
         let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
             labels.contains(&truth) || labels.contains(&stated)
         };
-        let mut gone: Vec<_> = self
+        let gone: Vec<_> = self
             .cells
             .iter()
             .filter(|(cell, _)| is_about(cell))
             .map(|(cell, n)| (*cell, *n))
             .collect();
-        // The order of a hash map differs between processes, and with it the rounding of sums.
-        gone.sort_by_key(|(cell, _)| *cell);
         for ((truth, stated), count) in gone {
             self.add_scaled(truth, stated, -count);
             self.cells.remove(&(truth, stated));
