@@ -21,7 +21,9 @@ mod confusion;
 mod dawid_skene;
 mod dependence;
 mod label_bias;
+mod label_map;
 mod label_table;
+mod landmark_table;
 mod landmark_votes;
 mod likelihood;
 mod method;
@@ -107,7 +109,8 @@ pub struct Vote {
     config: VoteConfig,
     /// Whether landmarks are taken from the reports.
     open: bool,
-    landmarks: BTreeMap<LandmarkId, Option<Landmark>>,
+    /// `None` for a landmark of an open cell.
+    landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
     /// Landmarks of an open cell, oldest first.
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
@@ -130,7 +133,7 @@ impl Vote {
             open: landmarks.is_empty(),
             landmarks: landmarks
                 .into_iter()
-                .map(|l| (l.id.clone(), Some(l)))
+                .map(|l| (l.id.clone(), Some(Box::new(l))))
                 .collect(),
             arrivals: VecDeque::new(),
             last_reports: BTreeMap::new(),
@@ -155,7 +158,7 @@ impl Vote {
         let is_open = landmarks.is_empty();
         let mut known: BTreeMap<_, _> = landmarks
             .into_iter()
-            .map(|l| (l.id.clone(), Some(l)))
+            .map(|l| (l.id.clone(), Some(Box::new(l))))
             .collect();
         if is_open {
             self.arrivals
@@ -291,7 +294,7 @@ impl Vote {
                     let landmark = object
                         .landmark
                         .as_ref()
-                        .and_then(|id| self.landmarks.get(id)?.as_ref());
+                        .and_then(|id| self.landmarks.get(id)?.as_deref());
                     let rank = |object: &PerceivedObject| {
                         (
                             !self.is_sign(landmark, self.voted_label(landmark, &object.label)),
@@ -324,7 +327,7 @@ impl Vote {
         if known.is_none() && !self.open {
             return false;
         }
-        let landmark = known.and_then(Option::as_ref);
+        let landmark = known.and_then(Option::as_deref);
         let position = landmark.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
         let label = self.voted_label(landmark, &object.label).clone();
         let is_sign = self.is_sign(landmark, &label);
@@ -406,7 +409,7 @@ impl Vote {
     pub fn readings(&self, landmark: &LandmarkId, now: Timestamp) -> Vec<LabelReading> {
         let mut readings = self.method.get().readings(landmark);
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
-        let known = self.landmarks.get(landmark).and_then(Option::as_ref);
+        let known = self.landmarks.get(landmark).and_then(Option::as_deref);
         if let (Some(sign), Some(signs)) = (
             known.and_then(|l| l.vacancy.as_ref()),
             self.signs.get(landmark),
@@ -455,9 +458,11 @@ impl Vote {
 
     /// Ends the round: evaluates the landmarks that changed.
     pub fn close(&mut self, now: Timestamp) -> VoteRound {
-        self.last_reports
-            .values_mut()
-            .for_each(|last| last.frames = 0);
+        if self.config.mode == VoteMode::Paper {
+            self.last_reports
+                .values_mut()
+                .for_each(|last| last.frames = 0);
+        }
         let (changed, evidence) = self.method.get_mut().close(now);
         let verdicts = if self.open {
             changed

@@ -19,6 +19,9 @@ const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and greatest weight of a vote for its confidence.
 const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
+/// Index of a band.
+pub(super) type Band = u8;
+
 /// Agreement of votes with the other vehicles' votes, by band.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct BandCounts {
@@ -27,9 +30,9 @@ struct BandCounts {
 }
 
 impl BandCounts {
-    fn add(&mut self, band: usize, agreement: f64, sign: f64) {
-        self.votes[band] += sign;
-        self.agreed[band] += sign * agreement;
+    fn add(&mut self, band: Band, agreement: f64, sign: f64) {
+        self.votes[usize::from(band)] += sign;
+        self.agreed[usize::from(band)] += sign * agreement;
     }
 
     fn fade(&mut self, factor: f64) {
@@ -108,7 +111,7 @@ impl ConfidenceCalibration {
     }
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
-    pub(super) fn band(&self, vehicle: usize, confidence: f64) -> usize {
+    pub(super) fn band(&self, vehicle: usize, confidence: f64) -> Band {
         let (stated, total) = self
             .histograms
             .get(vehicle)
@@ -117,17 +120,17 @@ impl ConfidenceCalibration {
         let below: f64 = stated[..bin].iter().sum();
         let rank =
             (below + 0.5 * stated[bin] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
-        ((rank * BANDS as f64) as usize).min(BANDS - 1)
+        ((rank * BANDS as f64) as Band).min(BANDS as Band - 1)
     }
 
     /// Counts a live vote that the others support with probability `agreement`; with `sign` −1
     /// subtracts it.
-    pub(super) fn count(&mut self, band: usize, agreement: f64, sign: f64) {
+    pub(super) fn count(&mut self, band: Band, agreement: f64, sign: f64) {
         self.live.add(band, agreement, sign);
     }
 
     /// Counts a settled vote.
-    pub(super) fn settle(&mut self, band: usize, agreement: f64) {
+    pub(super) fn settle(&mut self, band: Band, agreement: f64) {
         self.settled.fade(1.0 - 1.0 / MEMORY_VOTES);
         self.settled.add(band, agreement, 1.0);
     }
@@ -234,7 +237,7 @@ pub(super) struct Weights {
 
 impl Weights {
     /// Weight of a vote of the stated confidence; 1 when all votes have the same confidence.
-    pub(super) fn of(&self, band: usize, confidence: f64) -> f64 {
+    pub(super) fn of(&self, band: Band, confidence: f64) -> f64 {
         let n = self.votes;
         let (low, high) = WEIGHT_RANGE;
         let stated = if self.mean > 0.0 {
@@ -242,7 +245,7 @@ impl Weights {
         } else {
             1.0
         };
-        (n * self.ratios[band] + self.prior_votes * stated) / (n + self.prior_votes)
+        (n * self.ratios[usize::from(band)] + self.prior_votes * stated) / (n + self.prior_votes)
     }
 }
 

@@ -1,19 +1,20 @@
 //! Confusion counts: how often each label was stated where each was true.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-/// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
-pub(super) type LabelIndex = u16;
+use super::label_map::{LabelIndex, LabelMap};
 
 /// Scale below which all counts are rescaled.
 const MIN_SCALE: f64 = 1e-60;
 
-/// Sparse expected counts of (true label, stated label): pairs that did not occur take no memory.
-/// All counts share one scale, so that the cost of fading does not depend on their number.
+/// Sparse expected counts of (true label, stated label). All counts share one scale, so that the
+/// cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
-    cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
-    rows: BTreeMap<LabelIndex, f64>,
+    /// Counts by true label, by stated label: a vote reads and changes one column.
+    columns: LabelMap<LabelMap<f64>>,
+    /// Sums over the columns, by true label.
+    rows: LabelMap<f64>,
     correct: f64,
     total: f64,
     scale: f64,
@@ -22,8 +23,8 @@ pub(super) struct Confusion {
 impl Default for Confusion {
     fn default() -> Self {
         Self {
-            cells: BTreeMap::new(),
-            rows: BTreeMap::new(),
+            columns: LabelMap::default(),
+            rows: LabelMap::default(),
             correct: 0.0,
             total: 0.0,
             scale: 1.0,
@@ -31,70 +32,102 @@ impl Default for Confusion {
     }
 }
 
-impl Confusion {
-    /// Adds `weight`; a negative weight removes evidence.
-    pub(super) fn add(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
-        self.add_scaled(truth, stated, weight / self.scale);
+/// The votes for one label, for reading.
+pub(super) struct StatedVotes<'a> {
+    column: Option<&'a LabelMap<f64>>,
+    rows: &'a LabelMap<f64>,
+    scale: f64,
+}
+
+impl StatedVotes<'_> {
+    /// Number of these votes where `truth` was true.
+    pub(super) fn where_true(&self, truth: LabelIndex) -> f64 {
+        let votes = self.column.and_then(|column| column.get(truth));
+        self.scale * votes.map_or(0.0, |votes| votes.max(0.0))
     }
 
-    fn add_scaled(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
-        *self.cells.entry((truth, stated)).or_insert(0.0) += weight;
-        *self.rows.entry(truth).or_insert(0.0) += weight;
-        self.total += weight;
-        if truth == stated {
-            self.correct += weight;
+    /// Number of votes for any label where `truth` was true.
+    pub(super) fn all_where_true(&self, truth: LabelIndex) -> f64 {
+        let votes = self.rows.get(truth);
+        self.scale * votes.map_or(0.0, |votes| votes.max(0.0))
+    }
+}
+
+impl Confusion {
+    /// Adds a vote of `weight` for `stated`, given the probability of each true label; a negative
+    /// weight removes it.
+    pub(super) fn add(
+        &mut self,
+        stated: LabelIndex,
+        truths: impl IntoIterator<Item = (LabelIndex, f64)>,
+        weight: f64,
+    ) {
+        let weight = weight / self.scale;
+        let column = self.columns.entry(stated);
+        for (truth, p) in truths {
+            let votes = p * weight;
+            *column.entry(truth) += votes;
+            *self.rows.entry(truth) += votes;
+            self.total += votes;
+            if truth == stated {
+                self.correct += votes;
+            }
         }
     }
 
     /// Removes all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
-        let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
-            labels.contains(&truth) || labels.contains(&stated)
-        };
-        let gone: Vec<_> = self
-            .cells
-            .iter()
-            .filter(|(cell, _)| is_about(cell))
-            .map(|(cell, n)| (*cell, *n))
-            .collect();
-        for ((truth, stated), count) in gone {
-            self.add_scaled(truth, stated, -count);
-            self.cells.remove(&(truth, stated));
+        let is_kept = |label| !labels.contains(&label);
+        self.columns.retain(|stated, _| is_kept(stated));
+        for column in self.columns.values_mut() {
+            column.retain(|truth, _| is_kept(truth));
         }
-        self.rows.retain(|truth, _| !labels.contains(truth));
+        self.rows = LabelMap::default();
+        self.correct = 0.0;
+        self.total = 0.0;
+        for (stated, column) in self.columns.iter() {
+            for (truth, votes) in column.iter() {
+                *self.rows.entry(truth) += votes;
+                self.total += votes;
+                if truth == stated {
+                    self.correct += votes;
+                }
+            }
+        }
     }
 
     /// Multiplies all evidence by `factor`.
     pub(super) fn fade(&mut self, factor: f64) {
         self.scale *= factor;
         if self.scale < MIN_SCALE {
-            self.cells.values_mut().for_each(|c| *c *= self.scale);
-            self.rows.values_mut().for_each(|r| *r *= self.scale);
+            let columns = self.columns.values_mut();
+            for votes in columns.flat_map(LabelMap::values_mut) {
+                *votes *= self.scale;
+            }
+            for votes in self.rows.values_mut() {
+                *votes *= self.scale;
+            }
             self.correct *= self.scale;
             self.total *= self.scale;
             self.scale = 1.0;
         }
     }
 
-    /// Number of votes for `stated` where `truth` was true.
-    pub(super) fn cell(&self, truth: LabelIndex, stated: LabelIndex) -> f64 {
-        self.cells
-            .get(&(truth, stated))
-            .map_or(0.0, |c| self.scale * c.max(0.0))
-    }
-
-    /// Number of votes where `truth` was true.
-    pub(super) fn row(&self, truth: LabelIndex) -> f64 {
-        self.rows
-            .get(&truth)
-            .map_or(0.0, |r| self.scale * r.max(0.0))
+    /// The votes for a label.
+    pub(super) fn stated(&self, label: LabelIndex) -> StatedVotes<'_> {
+        StatedVotes {
+            column: self.columns.get(label),
+            rows: &self.rows,
+            scale: self.scale,
+        }
     }
 
     /// Labels with the number of votes for them where they were true.
     pub(super) fn diagonal(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
-        self.rows
-            .keys()
-            .map(|&truth| (truth, self.cell(truth, truth)))
+        self.columns.iter().map(|(label, column)| {
+            let right = column.get(label).copied().unwrap_or_default();
+            (label, self.scale * right.max(0.0))
+        })
     }
 
     /// Number of right votes.
@@ -122,9 +155,9 @@ mod tests {
             (1, 1, 8.0),
             (2, 0, 0.5),
         ] {
-            confusion.add(truth, stated, weight);
+            confusion.add(stated, [(truth, 1.0)], weight);
             if truth != 1 && stated != 1 {
-                without.add(truth, stated, weight);
+                without.add(stated, [(truth, 1.0)], weight);
             }
         }
         confusion.forget_labels(&[1].into());
@@ -136,7 +169,7 @@ mod tests {
         let (mut confusion, mut expected) = (Confusion::default(), 0.0);
         for step in 0..200_000u32 {
             confusion.fade(if step % 1000 == 0 { 0.1 } else { 0.998 });
-            confusion.add(0, (step % 2) as LabelIndex, 1.0);
+            confusion.add((step % 2) as LabelIndex, [(0, 1.0)], 1.0);
             expected = expected * if step % 1000 == 0 { 0.1 } else { 0.998 } + 1.0;
         }
         assert!(
@@ -144,7 +177,9 @@ mod tests {
             "{} {expected}",
             confusion.total()
         );
-        assert!((confusion.cell(0, 0) + confusion.cell(0, 1) - confusion.row(0)).abs() < 1e-9);
-        assert!((confusion.cell(0, 0) - confusion.correct()).abs() < 1e-9);
+        let (zero, one) = (confusion.stated(0), confusion.stated(1));
+        let both = zero.where_true(0) + one.where_true(0);
+        assert!((both - zero.all_where_true(0)).abs() < 1e-9);
+        assert!((zero.where_true(0) - confusion.correct()).abs() < 1e-9);
     }
 }

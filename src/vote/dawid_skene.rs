@@ -13,8 +13,9 @@
 use std::collections::BTreeSet;
 
 use super::config::WeightedConfig;
-use super::confusion::{Confusion, LabelIndex};
+use super::confusion::Confusion;
 use super::label_bias::LabelBias;
+use super::label_map::LabelIndex;
 use super::likelihood::{
     LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability,
 };
@@ -299,6 +300,8 @@ impl DawidSkene {
         let vehicle = &self.vehicles[vote.vehicle];
         let wrong = (1.0 - vehicle.accuracy) / self.wrong_labels();
         let prior = self.config.class_prior_votes;
+        let evidence = [&vehicle.live, &vehicle.settled, &vehicle.inherited]
+            .map(|confusion| confusion.stated(vote.label));
         let stating = candidates.iter().map(|&truth| {
             let coin = if truth == vote.label {
                 vehicle.accuracy
@@ -308,9 +311,8 @@ impl DawidSkene {
             if self.class_weight == 0.0 {
                 return coin;
             }
-            let evidence = [&vehicle.live, &vehicle.settled, &vehicle.inherited];
-            let stated: f64 = evidence.iter().map(|e| e.cell(truth, vote.label)).sum();
-            let votes: f64 = evidence.iter().map(|e| e.row(truth)).sum();
+            let stated: f64 = evidence.iter().map(|e| e.where_true(truth)).sum();
+            let votes: f64 = evidence.iter().map(|e| e.all_where_true(truth)).sum();
             let own = (stated + prior * coin) / (votes + prior);
             coin + self.class_weight * (own - coin)
         });
@@ -353,14 +355,13 @@ impl DawidSkene {
     ) {
         for &(truth, p) in posterior {
             self.shares.add(truth, sign * p);
-            for vote in votes.iter().filter(|_| votes.len() > 1) {
-                let weight = sign * p * vote.weight.min(1.0);
-                self.vehicles[vote.vehicle]
-                    .live
-                    .add(truth, vote.label, weight);
-                let right = if truth == vote.label { weight } else { 0.0 };
-                self.live.add(right, weight);
-            }
+        }
+        for vote in votes.iter().filter(|_| votes.len() > 1) {
+            let weight = sign * vote.weight.min(1.0);
+            let live = &mut self.vehicles[vote.vehicle].live;
+            live.add(vote.label, posterior.iter().copied(), weight);
+            let right = probability(posterior, vote.label);
+            self.live.add(weight * right, weight);
         }
     }
 
@@ -386,12 +387,8 @@ impl DawidSkene {
         evidence.settled.fade(fade);
         evidence.inherited.fade(fade);
         self.settled.fade(fleet_fade);
-        for (truth, p) in sharpened(others) {
-            evidence
-                .settled
-                .add(truth, vote.label, p * vote.weight.min(1.0));
-        }
         let weight = vote.weight.min(1.0);
+        evidence.settled.add(vote.label, sharpened(others), weight);
         for (truth, p) in sharpened(all) {
             let right = if truth == vote.label { p * weight } else { 0.0 };
             self.settled.add(right, p * weight);

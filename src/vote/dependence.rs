@@ -14,7 +14,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::confusion::LabelIndex;
+use super::label_map::LabelIndex;
 
 /// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost
 /// of a vote.

@@ -17,7 +17,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::confusion::LabelIndex;
+use super::label_map::{LabelIndex, LabelMap};
 
 /// φ₀: the contingency of vehicles and labels up to which one accuracy per vehicle describes them
 /// better than a confusion matrix that is estimated from votes.
@@ -29,7 +29,7 @@ struct Preferences {
     votes: f64,
     /// Sum of the squares of the votes' weights.
     squares: f64,
-    labels: BTreeMap<LabelIndex, LabelSums>,
+    labels: LabelMap<LabelSums>,
 }
 
 /// Least sum of shares that is kept.
@@ -50,7 +50,7 @@ struct LabelSums {
 impl Preferences {
     /// Adds a vote; `own` is 1 if it is for the label, else 0.
     fn add(&mut self, label: LabelIndex, own: f64, share_of_others: f64) {
-        let sums = self.labels.entry(label).or_default();
+        let sums = self.labels.entry(label);
         let deviation = own - share_of_others;
         sums.share += (own + share_of_others) / 2.0;
         sums.deviation += deviation;
@@ -122,9 +122,9 @@ impl LabelBias {
         if votes.len() < 2 {
             return;
         }
-        let mut stated: BTreeMap<LabelIndex, f64> = BTreeMap::new();
+        let mut stated: LabelMap<f64> = LabelMap::default();
         for (_, label, _) in votes {
-            *stated.entry(*label).or_default() += 1.0;
+            *stated.entry(*label) += 1.0;
         }
         let others = (votes.len() - 1) as f64;
         let fade = 1.0 - 1.0 / self.memory_votes;
@@ -139,7 +139,7 @@ impl LabelBias {
             }
             preferences.votes += 1.0;
             preferences.squares += 1.0;
-            for (&label, &count) in &stated {
+            for (label, &count) in stated.iter() {
                 let own = f64::from(u8::from(label == stated_label));
                 preferences.add(label, own, (count - own) / others);
             }
@@ -196,7 +196,7 @@ impl LabelBias {
         for preferences in self.vehicles.iter_mut().chain(&mut self.inherited) {
             preferences
                 .labels
-                .retain(|label, _| !labels.contains(label));
+                .retain(|label, _| !labels.contains(&label));
         }
         self.since = self.since.max(self.read);
     }
@@ -218,7 +218,7 @@ impl LabelBias {
         let mut labels: BTreeMap<LabelIndex, (f64, f64)> = BTreeMap::new();
         for preferences in self.vehicles.iter().chain(&self.inherited) {
             read += preferences.labels.len();
-            for (&label, &sums) in &preferences.labels {
+            for (label, &sums) in preferences.labels.iter() {
                 let (share, variance) = labels.entry(label).or_default();
                 *share += sums.share;
                 *variance += preferences.weighted_variance(sums);

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::confusion::LabelIndex;
+use super::label_map::LabelIndex;
 use crate::model::names::Label;
 use crate::model::time::Timestamp;
 

@@ -1,11 +1,9 @@
 //! The votes on one landmark.
 
-use std::collections::BTreeSet;
-
-use super::calibration::{ConfidenceCalibration, Weights};
-use super::confusion::LabelIndex;
+use super::calibration::{Band, ConfidenceCalibration, Weights};
 use super::dependence::Dependence;
 use super::label_bias::LabelBias;
+use super::label_map::LabelIndex;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
 
@@ -29,8 +27,8 @@ pub(super) struct StoredVote {
     pub(super) at: Timestamp,
     /// Time since which it counts again as evidence.
     pub(super) since: Timestamp,
-    /// Rank of its confidence as of the last judgement.
-    pub(super) band: usize,
+    /// Band of its confidence as of the last judgement.
+    pub(super) band: Band,
     /// Probability that the others assign to its label, while the live evidence on confidences
     /// contains it.
     pub(super) agreement: Option<f64>,
@@ -44,7 +42,9 @@ pub(super) struct StoredVote {
 /// label. A single frame that shows a wrong label does not change the vehicle's vote.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct RecentStatements {
-    labels: [(LabelIndex, f64); 3],
+    labels: [LabelIndex; 3],
+    /// Fading weight of the statements of each of these labels.
+    sums: [f64; 3],
     /// Fading number of statements.
     statements: f64,
 }
@@ -54,37 +54,36 @@ impl RecentStatements {
     /// label stated most.
     pub(super) fn add(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
         self.statements = self.statements * kept + 1.0;
-        self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
-        let known = self
-            .labels
-            .iter()
-            .position(|(known, sum)| *known == label && *sum > 0.0);
-        let least =
-            (0..self.labels.len()).min_by(|&a, &b| self.labels[a].1.total_cmp(&self.labels[b].1));
-        let place = &mut self.labels[known.or(least).unwrap_or_default()];
-        *place = (label, weight + known.map_or(0.0, |_| place.1));
-        let stated = *place;
-        let more = self
-            .labels
-            .iter()
-            .copied()
-            .filter(|(_, sum)| *sum > stated.1);
-        more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
+        self.sums.iter_mut().for_each(|sum| *sum *= kept);
+        let places = 0..self.labels.len();
+        let by_sum = |a: &usize, b: &usize| self.sums[*a].total_cmp(&self.sums[*b]);
+        let known = places
+            .clone()
+            .find(|&place| self.labels[place] == label && self.sums[place] > 0.0);
+        let least = places.clone().min_by(by_sum);
+        let stated = known.or(least).unwrap_or_default();
+        self.labels[stated] = label;
+        self.sums[stated] = weight + known.map_or(0.0, |known| self.sums[known]);
+        let by_sum = |a: &usize, b: &usize| self.sums[*a].total_cmp(&self.sums[*b]);
+        let more = places.filter(|&place| self.sums[place] > self.sums[stated]);
+        self.labels[more.max_by(by_sum).unwrap_or(stated)]
     }
 
     /// Removes statements of labels whose indices may be reused.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
-        self.labels
-            .iter_mut()
-            .filter(|(label, _)| is_gone(*label))
-            .for_each(|place| *place = (0, 0.0));
+        for (label, sum) in self.labels.iter_mut().zip(&mut self.sums) {
+            if is_gone(*label) {
+                *label = 0;
+                *sum = 0.0;
+            }
+        }
     }
 
     /// Certainty, 0 to 1, that the most stated label is not due to chance: the lead over the next
     /// label in standard deviations of a multinomial draw, as a two-sided probability. A vehicle
     /// that alternates between two labels has almost no vote.
     pub(super) fn certainty(&self) -> f64 {
-        let mut sums = self.labels.map(|(_, sum)| sum);
+        let mut sums = self.sums;
         sums.sort_by(f64::total_cmp);
         let [third, second, first] = sums;
         let total = (first + second + third).max(f64::MIN_POSITIVE);
@@ -121,17 +120,26 @@ pub(super) struct LandmarkVotes {
 }
 
 impl LandmarkVotes {
+    pub(super) fn of_vehicle(&self, vehicle: usize) -> Option<&StoredVote> {
+        let place = self.place(vehicle).ok()?;
+        Some(&self.votes[place])
+    }
+
+    /// The place of a vehicle's vote, or where it would be.
+    fn place(&self, vehicle: usize) -> Result<usize, usize> {
+        self.votes
+            .binary_search_by_key(&vehicle, |vote| vote.vehicle)
+    }
+
     pub(super) fn weighted_votes(&self) -> Vec<WeightedVote> {
         self.votes.iter().map(StoredVote::weighted).collect()
     }
 
     pub(super) fn candidates(&self) -> Vec<LabelIndex> {
-        self.votes
-            .iter()
-            .map(|c| c.label)
-            .collect::<BTreeSet<_>>()
-            .into_iter()
-            .collect()
+        let mut labels: Vec<_> = self.votes.iter().map(|c| c.label).collect();
+        labels.sort_unstable();
+        labels.dedup();
+        labels
     }
 
     /// Counts new votes as evidence on dependence, label bias and confidences; where there are many
@@ -176,9 +184,8 @@ impl LandmarkVotes {
                 ..
             } = self.votes[place];
             let agrees = |other: usize| {
-                self.votes
-                    .binary_search_by_key(&other, |c| c.vehicle)
-                    .is_ok_and(|at| self.votes[at].label == label)
+                self.of_vehicle(other)
+                    .is_some_and(|vote| vote.label == label)
             };
             let independence = dependence.independence(vehicle, agrees);
             let band = calibration.band(vehicle, confidence);
@@ -256,6 +263,18 @@ impl LandmarkVotes {
             self.posterior.clear();
         }
         votes - self.votes.len()
+    }
+
+    /// Stores a vehicle's vote in place of its earlier one. Millions of votes may be stored, so room
+    /// is made for no more than there are.
+    pub(super) fn store(&mut self, vote: StoredVote) {
+        match self.place(vote.vehicle) {
+            Ok(place) => self.votes[place] = vote,
+            Err(place) => {
+                self.votes.reserve_exact(1);
+                self.votes.insert(place, vote);
+            }
+        }
     }
 
     /// Whether several vehicles voted, so that they can be compared with each other.

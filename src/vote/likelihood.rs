@@ -1,6 +1,6 @@
 //! Likelihood of votes and the posterior that follows from it.
 
-use super::confusion::LabelIndex;
+use super::label_map::LabelIndex;
 
 /// A vote in the form for the model.
 #[derive(Debug, Clone, Copy)]

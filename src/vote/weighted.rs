@@ -8,15 +8,15 @@ mod settlement;
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::ops::Bound;
 use std::time::Duration;
 
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::config::{VoteConfig, WeightedConfig};
-use super::confusion::LabelIndex;
 use super::dawid_skene::{DawidSkene, VehicleEvidence};
 use super::dependence::Dependence;
+use super::label_map::LabelIndex;
 use super::label_table::LabelTable;
+use super::landmark_table::LandmarkTable;
 use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
 use super::method::{self, NewVote, VotingMethod};
 use super::paper::REPUTATION_RANGE;
@@ -49,11 +49,11 @@ pub(super) struct WeightedVoting {
     /// Votes of other cells, also about vehicles that have not voted yet.
     foreign: BTreeMap<NodeName, ForeignVotes>,
     labels: LabelTable,
-    landmarks: BTreeMap<LandmarkId, LandmarkVotes>,
-    /// Landmarks to evaluate when the round closes.
-    changed: BTreeSet<LandmarkId>,
+    landmarks: LandmarkTable,
+    /// Indices of the landmarks to evaluate when the round closes.
+    changed: BTreeSet<usize>,
     /// The next expiry of each landmark that has votes.
-    expiries: BTreeSet<(Timestamp, LandmarkId)>,
+    expiries: BTreeSet<(Timestamp, usize)>,
     /// The landmark that was re-evaluated last.
     revisit_after: Option<LandmarkId>,
     /// Votes since the last round.
@@ -100,11 +100,9 @@ impl WeightedVoting {
     }
 
     /// Evaluates a landmark's votes from scratch.
-    fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
+    fn judge(&mut self, landmark: usize, weights: &Weights) {
         self.remove_live(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
-            return;
-        };
+        let landmark_votes = self.landmarks.votes_mut(landmark);
         landmark_votes.compare(
             &mut self.dependence,
             &mut self.model.label_bias,
@@ -135,7 +133,7 @@ impl WeightedVoting {
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
         self.landmarks
-            .values()
+            .iter()
             .flat_map(|l| &l.votes)
             .for_each(|vote| present[vote.vehicle] = true);
         let groups = self.dependence.fit(&present);
@@ -160,35 +158,24 @@ impl WeightedVoting {
 
     /// Re-evaluates older landmarks in turn, within the budget for this round's fresh votes; adds
     /// those whose published label changed to `changed`.
-    fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
+    fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<usize>) {
         let mut budget =
             (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
         let mut visits = self.landmarks.len();
         while budget > 0 && visits > 0 {
             visits -= 1;
-            let after = self
-                .revisit_after
-                .as_ref()
-                .map_or(Bound::Unbounded, Bound::Excluded);
-            let next = self
-                .landmarks
-                .range::<LandmarkId, _>((after, Bound::Unbounded))
-                .next();
-            let Some((landmark, landmark_votes)) = next.map(|(l, v)| (l.clone(), v)) else {
+            let Some(landmark) = self.landmarks.next(self.revisit_after.as_ref()) else {
                 self.revisit_after = None;
                 continue;
             };
+            self.revisit_after = Some(self.landmarks.id(landmark).clone());
+            let landmark_votes = self.landmarks.votes(landmark);
             budget = budget.saturating_sub(landmark_votes.votes.len().max(1));
             let before = landmark_votes.published;
-            self.judge(&landmark, weights);
-            if self
-                .landmarks
-                .get(&landmark)
-                .is_some_and(|l| l.published != before)
-            {
-                changed.insert(landmark.clone());
+            self.judge(landmark, weights);
+            if self.landmarks.votes(landmark).published != before {
+                changed.insert(landmark);
             }
-            self.revisit_after = Some(landmark);
         }
     }
 
@@ -208,20 +195,20 @@ impl VotingMethod for WeightedVoting {
     }
 
     fn add_landmark(&mut self, landmark: LandmarkId) {
-        self.landmarks.entry(landmark).or_default();
+        self.landmarks.intern(&landmark);
     }
 
     /// The results of the landmark's votes are kept.
     fn remove_landmark(&mut self, landmark: &LandmarkId) {
-        self.remove_votes(landmark, |_| true);
-        if let Some(due) = self
-            .landmarks
-            .remove(landmark)
-            .and_then(|landmark_votes| landmark_votes.due)
-        {
-            self.expiries.remove(&(due, landmark.clone()));
+        let Some(index) = self.landmarks.index(landmark) else {
+            return;
+        };
+        self.remove_votes(index, |_| true);
+        if let Some(due) = self.landmarks.votes(index).due {
+            self.expiries.remove(&(due, index));
         }
-        self.changed.remove(landmark);
+        self.changed.remove(&index);
+        self.landmarks.remove(landmark);
     }
 
     /// Removes the vehicles' votes and all evidence about them; other vehicles reuse their indices.
@@ -235,23 +222,16 @@ impl VotingMethod for WeightedVoting {
 
     /// Adds a vote in place of the vehicle's earlier vote on the landmark.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
-        let &NewVote {
-            landmark,
-            confidence,
-            at,
-            ..
-        } = vote;
+        let &NewVote { confidence, at, .. } = vote;
         let visibility = vote
             .range_bearing
             .map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a));
         self.expire(at);
         let vehicle = self.vehicle(vote.node);
         let label = self.label(vote.label, Some((vehicle, at)));
+        let landmark = self.landmarks.intern(vote.landmark);
         let freshness = self.freshness();
-        let earlier = self
-            .landmarks
-            .get(landmark)
-            .and_then(|l| l.votes.iter().find(|v| v.vehicle == vehicle).copied());
+        let earlier = self.landmarks.votes(landmark).of_vehicle(vehicle).copied();
         let mut recent = earlier.map_or_else(RecentStatements::default, |earlier| earlier.recent);
         let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
         let fading_s = self.config.freshness_s * self.config.smoothing_share;
@@ -316,18 +296,12 @@ impl VotingMethod for WeightedVoting {
                 first
             }
         };
-        let landmark_votes = self.landmarks.entry(landmark.clone()).or_default();
-        match landmark_votes
-            .votes
-            .binary_search_by_key(&vehicle, |vote| vote.vehicle)
-        {
-            Ok(place) => landmark_votes.votes[place] = stored,
-            Err(place) => landmark_votes.votes.insert(place, stored),
-        }
+        let landmark_votes = self.landmarks.votes_mut(landmark);
+        landmark_votes.store(stored);
         if landmark_votes.due.is_none_or(|due| due > at + freshness) {
             self.schedule_expiry(landmark);
         }
-        self.changed.insert(landmark.clone());
+        self.changed.insert(landmark);
         self.fresh_votes += 1;
     }
 
@@ -339,10 +313,16 @@ impl VotingMethod for WeightedVoting {
         }
         let weights = self.calibration.weights();
         let mut changed = std::mem::take(&mut self.changed);
-        for landmark in &changed {
+        let mut by_name: Vec<usize> = changed.iter().copied().collect();
+        by_name.sort_unstable_by_key(|&landmark| self.landmarks.id(landmark));
+        for landmark in by_name {
             self.judge(landmark, &weights);
         }
         self.revisit(&weights, &mut changed);
+        let changed = changed
+            .into_iter()
+            .map(|landmark| self.landmarks.id(landmark).clone())
+            .collect();
         (changed, std::mem::take(&mut self.evidence))
     }
 
@@ -352,7 +332,7 @@ impl VotingMethod for WeightedVoting {
             posterior,
             published,
             ..
-        } = self.landmarks.get(landmark)?;
+        } = self.landmarks.votes(self.landmarks.index(landmark)?);
         let mass: f64 = votes
             .iter()
             .map(|v| self.score(v.vehicle) * v.weight * v.independence)
@@ -377,11 +357,10 @@ impl VotingMethod for WeightedVoting {
 
     fn readings(&self, landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
         let mut readings: BTreeMap<Label, Vec<NodeName>> = BTreeMap::new();
-        for vote in self
-            .landmarks
-            .get(landmark)
+        let known = self.landmarks.index(landmark);
+        for vote in known
             .into_iter()
-            .flat_map(|known| &known.votes)
+            .flat_map(|index| &self.landmarks.votes(index).votes)
         {
             let label = self.labels.name(vote.label).clone();
             readings
@@ -430,7 +409,7 @@ impl VotingMethod for WeightedVoting {
         self.recorded_from = now;
         self.evidence.clear();
         self.landmarks
-            .values_mut()
+            .iter_mut()
             .flat_map(|l| &mut l.votes)
             .for_each(|vote| vote.since = now);
     }

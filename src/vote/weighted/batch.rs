@@ -18,7 +18,8 @@ impl WeightedVoting {
             .values()
             .enumerate()
             .for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
-        for landmark_votes in self.landmarks.values_mut() {
+        for landmark in self.landmarks.by_name() {
+            let landmark_votes = self.landmarks.votes_mut(landmark);
             landmark_votes
                 .votes
                 .iter_mut()
@@ -45,13 +46,16 @@ impl WeightedVoting {
 
     /// One pass: evaluates every landmark by the same evidence, then replaces the live evidence.
     fn judge_together(&mut self) {
+        let landmarks = self.landmarks.by_name();
         self.model.refresh(0..self.names.len());
         let weights = self.calibration.weights();
-        for landmark_votes in self.landmarks.values_mut() {
+        for &landmark in &landmarks {
+            let landmark_votes = self.landmarks.votes_mut(landmark);
             landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
         }
         self.calibration.clear_live();
-        for landmark_votes in self.landmarks.values_mut() {
+        for &landmark in &landmarks {
+            let landmark_votes = self.landmarks.votes_mut(landmark);
             let judged = self.model.judge(
                 &landmark_votes.weighted_votes(),
                 &landmark_votes.candidates(),
@@ -59,7 +63,8 @@ impl WeightedVoting {
             landmark_votes.take(judged, &mut self.calibration);
         }
         self.model.clear_live();
-        for landmark_votes in self.landmarks.values_mut() {
+        for &landmark in &landmarks {
+            let landmark_votes = self.landmarks.votes_mut(landmark);
             self.model.add_live(
                 &landmark_votes.weighted_votes(),
                 &landmark_votes.posterior,
@@ -76,8 +81,9 @@ impl WeightedVoting {
         self.model.clear_live();
         self.calibration.clear_live();
         let weights = self.calibration.weights();
-        for (landmark, landmark_votes) in &mut self.landmarks {
-            self.changed.insert(landmark.clone());
+        for landmark in self.landmarks.by_name() {
+            self.changed.insert(landmark);
+            let landmark_votes = self.landmarks.votes_mut(landmark);
             landmark_votes.published = None;
             landmark_votes.counted = true;
             landmark_votes.weigh(&self.dependence, &self.calibration, &weights);

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 
 use super::{LandmarkVotes, StoredVote, WeightedVoting};
-use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::Counts;
-use crate::vote::confusion::LabelIndex;
 use crate::vote::dawid_skene::VehicleEvidence;
+use crate::vote::label_map::LabelIndex;
 
 impl WeightedVoting {
     /// Removes vehicles with their votes and the evidence about them; other vehicles reuse their
@@ -19,7 +19,7 @@ impl WeightedVoting {
             .collect();
         let is_theirs = |vote: &StoredVote| gone.contains(&vote.vehicle);
         for landmark in self.landmarks_where(|l| l.votes.iter().any(is_theirs)) {
-            self.remove_votes(&landmark, is_theirs);
+            self.remove_votes(landmark, is_theirs);
         }
         self.dependence.forget(&gone);
         self.calibration.forget(&gone);
@@ -32,11 +32,9 @@ impl WeightedVoting {
         self.free.extend(gone);
     }
 
-    fn landmarks_where(&self, is_affected: impl Fn(&LandmarkVotes) -> bool) -> Vec<LandmarkId> {
-        self.landmarks
-            .iter()
-            .filter(|(_, votes)| is_affected(votes))
-            .map(|(landmark, _)| landmark.clone())
+    fn landmarks_where(&self, is_affected: impl Fn(&LandmarkVotes) -> bool) -> Vec<usize> {
+        (0..self.landmarks.end())
+            .filter(|landmark| is_affected(self.landmarks.votes(*landmark)))
             .collect()
     }
 
@@ -68,14 +66,11 @@ impl WeightedVoting {
         let mut forgotten = 0;
         for landmark in self.landmarks_where(is_affected) {
             // Without settling: the other votes would become evidence more often than by their age.
-            self.remove_live(&landmark);
-            forgotten += self
-                .landmarks
-                .get_mut(&landmark)
-                .map_or(0, |l| l.forget_labels(is_gone));
+            self.remove_live(landmark);
+            forgotten += self.landmarks.votes_mut(landmark).forget_labels(is_gone);
             self.changed.insert(landmark);
         }
-        for vote in self.landmarks.values_mut().flat_map(|l| &mut l.votes) {
+        for vote in self.landmarks.iter_mut().flat_map(|l| &mut l.votes) {
             vote.recent.forget_labels(is_gone);
         }
         self.model.forget_labels(&gone);

@@ -7,8 +7,9 @@ use super::WeightedVoting;
 use crate::model::names::{Label, NodeName};
 use crate::reputation::{RememberedVotes, ReputationLedger};
 use crate::vote::config::VoteConfig;
-use crate::vote::confusion::{Confusion, LabelIndex};
+use crate::vote::confusion::Confusion;
 use crate::vote::label_bias::LabelRecord;
+use crate::vote::label_map::LabelIndex;
 
 impl WeightedVoting {
     /// Takes over the ledger's kept votes except those that were counted here: a standby has
@@ -64,15 +65,12 @@ impl WeightedVoting {
                 wrong,
             } in &records
             {
-                inherited.add(label, label, right);
-                let others: Vec<_> = (0..self.labels.len() as LabelIndex)
-                    .filter(|l| *l != label)
-                    .collect();
-                let each = wrong / others.len().max(1) as f64;
-                if each > 0.0 {
-                    others
-                        .into_iter()
-                        .for_each(|truth| inherited.add(truth, label, each));
+                inherited.add(label, [(label, 1.0)], right);
+                let labels = self.labels.len() as LabelIndex;
+                if wrong > 0.0 && labels > 1 {
+                    let each = 1.0 / f64::from(labels - 1);
+                    let others = (0..labels).filter(|truth| *truth != label);
+                    inherited.add(label, others.map(|truth| (truth, each)), wrong);
                 }
             }
             let vehicle = self.vehicle(&node);

@@ -1,24 +1,21 @@
 //! The life of a vote: live evidence while it is fresh, then settled evidence that fades.
 
 use super::{StoredVote, WeightedVoting};
-use crate::model::names::LandmarkId;
 use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
 use crate::vote::likelihood::probability;
 
 impl WeightedVoting {
     /// Sets the next expiry of a landmark: when its oldest vote goes stale.
-    pub(super) fn schedule_expiry(&mut self, landmark: &LandmarkId) {
+    pub(super) fn schedule_expiry(&mut self, landmark: usize) {
         let freshness = self.freshness();
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
-            return;
-        };
+        let landmark_votes = self.landmarks.votes_mut(landmark);
         let oldest = landmark_votes.votes.iter().map(|vote| vote.at).min();
         let due = oldest.map(|at| at + freshness);
         if let Some(before) = std::mem::replace(&mut landmark_votes.due, due) {
-            self.expiries.remove(&(before, landmark.clone()));
+            self.expiries.remove(&(before, landmark));
         }
-        self.expiries.extend(due.map(|due| (due, landmark.clone())));
+        self.expiries.extend(due.map(|due| (due, landmark)));
     }
 
     /// Removes the votes that are stale at `now`.
@@ -28,28 +25,18 @@ impl WeightedVoting {
             let Some((_, landmark)) = self.expiries.pop_first() else {
                 break;
             };
-            self.remove_votes(&landmark, |vote| vote.at + freshness <= now);
-            self.schedule_expiry(&landmark);
+            self.remove_votes(landmark, |vote| vote.at + freshness <= now);
+            self.schedule_expiry(landmark);
         }
     }
 
     /// Removes the votes that `is_past` selects, after all votes on the landmark have been settled.
-    pub(super) fn remove_votes(
-        &mut self,
-        landmark: &LandmarkId,
-        is_past: impl Fn(&StoredVote) -> bool,
-    ) {
-        if !self
-            .landmarks
-            .get(landmark)
-            .is_some_and(|l| l.votes.iter().any(&is_past))
-        {
+    pub(super) fn remove_votes(&mut self, landmark: usize, is_past: impl Fn(&StoredVote) -> bool) {
+        if !self.landmarks.votes(landmark).votes.iter().any(&is_past) {
             return;
         }
         self.settle_votes(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
-            return;
-        };
+        let landmark_votes = self.landmarks.votes_mut(landmark);
         landmark_votes.votes.retain(|vote| !is_past(vote));
         if landmark_votes.votes.is_empty() {
             landmark_votes.published = None;
@@ -58,10 +45,9 @@ impl WeightedVoting {
     }
 
     /// Removes a landmark's votes from the live evidence until it is evaluated again.
-    pub(super) fn remove_live(&mut self, landmark: &LandmarkId) {
-        if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
-            && std::mem::take(&mut landmark_votes.counted)
-        {
+    pub(super) fn remove_live(&mut self, landmark: usize) {
+        let landmark_votes = self.landmarks.votes_mut(landmark);
+        if std::mem::take(&mut landmark_votes.counted) {
             self.model.add_live(
                 &landmark_votes.weighted_votes(),
                 &landmark_votes.posterior,
@@ -80,11 +66,9 @@ impl WeightedVoting {
     ///
     /// All are settled at once. If they were settled in turn, the first would be evaluated by
     /// evidence that the others still lack.
-    pub(super) fn settle_votes(&mut self, landmark: &LandmarkId) {
+    pub(super) fn settle_votes(&mut self, landmark: usize) {
         self.remove_live(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
-            return;
-        };
+        let landmark_votes = self.landmarks.votes_mut(landmark);
         if landmark_votes.has_several_voters() {
             // The model evaluates a vote by the others: a vehicle that decides alone must not
             // confirm itself.
@@ -118,6 +102,6 @@ impl WeightedVoting {
         for vote in &mut landmark_votes.votes {
             (vote.since, vote.judged, vote.compared) = (vote.at, false, false);
         }
-        self.changed.insert(landmark.clone());
+        self.changed.insert(landmark);
     }
 }
