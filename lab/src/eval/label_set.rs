@@ -271,14 +271,14 @@ struct LabelSetReader {
     items: HashMap<String, usize>,
     voters: HashMap<String, usize>,
     labels: HashMap<String, usize>,
-    answers: Vec<BTreeMap<usize, VoterAnswer>>,
+    /// By item, in the order of the file.
+    answers: Vec<Vec<VoterAnswer>>,
     truths: HashMap<usize, usize>,
-    replaced: usize,
 }
 
 impl LabelSetReader {
     fn read_answers(&mut self, text: &str) -> Result<(), LabelSetError> {
-        let table = Table::new(text)?;
+        let mut table = Table::new(text)?;
         let item_column = table.column("item")?;
         let voter_column = table
             .column("voter")
@@ -286,8 +286,9 @@ impl LabelSetReader {
         let label_column = table.column("label")?;
         let confidence_column = table.column("confidence").ok();
         let truth_column = table.column("truth").ok();
-        for (line, row) in &table.rows {
-            let line = *line;
+        let mut is_empty = true;
+        while let Some((line, row)) = table.next_row()? {
+            is_empty = false;
             let cell = |column: usize, name: &'static str| match row.get(column) {
                 Some(text) if !text.is_empty() => Ok(text),
                 _ => Err(LabelSetError::Empty { line, column: name }),
@@ -308,21 +309,19 @@ impl LabelSetReader {
                         text: text.to_owned(),
                     })?,
             };
-            self.answers.resize_with(self.items.len(), BTreeMap::new);
+            self.answers.resize_with(self.items.len(), Vec::new);
             let answer = VoterAnswer {
                 voter,
                 label,
                 confidence,
             };
-            if self.answers[item].insert(voter, answer).is_some() {
-                self.replaced += 1;
-            }
+            self.answers[item].push(answer);
             let truth = truth_column.and_then(|column| row.get(column));
             if let Some(truth) = truth.filter(|truth| !truth.is_empty()) {
                 self.add_truth(line, item, item_name, truth)?;
             }
         }
-        if table.rows.is_empty() {
+        if is_empty {
             return Err(LabelSetError::NoAnswer);
         }
         Ok(())
@@ -330,15 +329,15 @@ impl LabelSetReader {
 
     /// Truths of items without answers are left out.
     fn read_truths(&mut self, text: &str) -> Result<(), LabelSetError> {
-        let table = Table::new(text)?;
+        let mut table = Table::new(text)?;
         let (item_column, truth_column) = (table.column("item")?, table.column("truth")?);
-        for (line, row) in &table.rows {
+        while let Some((line, row)) = table.next_row()? {
             let name = row.get(item_column).unwrap_or_default();
             let truth = row.get(truth_column).unwrap_or_default();
             if let Some(&item) = self.items.get(name)
                 && !truth.is_empty()
             {
-                self.add_truth(*line, item, name, truth)?;
+                self.add_truth(line, item, name, truth)?;
             }
         }
         Ok(())
@@ -372,24 +371,30 @@ impl LabelSetReader {
             number[self.labels[*name]] = place;
         }
         let labels = sorted.into_iter().cloned().collect();
-        let item = |(name, index): (&str, usize)| LabelledItem {
-            name: name.to_owned(),
-            answers: self.answers[index]
-                .values()
-                .map(|answer| VoterAnswer {
-                    label: number[answer.label],
-                    ..*answer
-                })
-                .collect(),
-            truth: self.truths.get(&index).map(|label| number[*label]),
+        let mut stated = self.answers;
+        let mut replaced = 0;
+        let item = |(name, index): (&str, usize)| {
+            let all = std::mem::take(&mut stated[index]);
+            let before = all.len();
+            let mut answers = last_answers(all);
+            replaced += before - answers.len();
+            for answer in &mut answers {
+                answer.label = number[answer.label];
+            }
+            LabelledItem {
+                name: name.to_owned(),
+                answers,
+                truth: self.truths.get(&index).map(|label| number[*label]),
+            }
         };
+        let items = in_order(&self.items).map(item).collect();
         Ok(LabelSet {
-            items: in_order(&self.items).map(item).collect(),
+            items,
             labels,
             voters: in_order(&self.voters)
                 .map(|(name, _)| name.to_owned())
                 .collect(),
-            replaced: self.replaced,
+            replaced,
         })
     }
 }
@@ -404,16 +409,33 @@ fn in_order(names: &HashMap<String, usize>) -> impl Iterator<Item = (&str, usize
     sorted.into_iter()
 }
 
-/// The rows of a table with a header.
-struct Table {
-    header: Vec<String>,
-    /// With the line in the file, from 1.
-    rows: Vec<(u64, csv::StringRecord)>,
+#[expect(
+    clippy::needless_pass_by_value,
+    reason = "as `Result::map_err` passes it"
+)]
+fn unreadable(error: csv::Error) -> LabelSetError {
+    LabelSetError::Table(error.to_string())
 }
 
-impl Table {
+/// The last answer of each voter, by voter.
+fn last_answers(mut answers: Vec<VoterAnswer>) -> Vec<VoterAnswer> {
+    answers.reverse();
+    answers.sort_by_key(|answer| answer.voter);
+    answers.dedup_by_key(|answer| answer.voter);
+    answers.shrink_to_fit();
+    answers
+}
+
+/// A table with a header, which is read row after row.
+struct Table<'a> {
+    header: Vec<String>,
+    reader: csv::Reader<&'a [u8]>,
+    row: csv::StringRecord,
+}
+
+impl<'a> Table<'a> {
     /// The separator is the most frequent of comma, semicolon and tab in the first line.
-    fn new(text: &str) -> Result<Self, LabelSetError> {
+    fn new(text: &'a str) -> Result<Self, LabelSetError> {
         let text = text.trim_start_matches('\u{feff}');
         let first = text.lines().next().unwrap_or_default();
         let count = |separator: u8| first.bytes().filter(|byte| *byte == separator).count();
@@ -423,15 +445,22 @@ impl Table {
             .trim(csv::Trim::All)
             .flexible(true)
             .from_reader(text.as_bytes());
-        let unreadable = |error: csv::Error| LabelSetError::Table(error.to_string());
         let header = reader.headers().map_err(unreadable)?;
         let header = header.iter().map(str::to_lowercase).collect();
-        let mut rows = Vec::new();
-        for row in reader.records() {
-            let row = row.map_err(unreadable)?;
-            rows.push((row.position().map_or(0, csv::Position::line), row));
+        Ok(Self {
+            header,
+            reader,
+            row: csv::StringRecord::new(),
+        })
+    }
+
+    /// The next row and its line in the file, from 1.
+    fn next_row(&mut self) -> Result<Option<(u64, &csv::StringRecord)>, LabelSetError> {
+        if !self.reader.read_record(&mut self.row).map_err(unreadable)? {
+            return Ok(None);
         }
-        Ok(Self { header, rows })
+        let line = self.row.position().map_or(0, csv::Position::line);
+        Ok(Some((line, &self.row)))
     }
 
     fn column(&self, name: &'static str) -> Result<usize, LabelSetError> {
