@@ -381,7 +381,7 @@ impl Aggregator {
     /// round; see [`Vote::refine`]. `None` without VOTE or leadership.
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
-        let verdicts = self.vote.as_mut()?.refine(passes);
+        let verdicts = self.vote.as_mut()?.refine(passes).collect();
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 

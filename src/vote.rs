@@ -470,7 +470,7 @@ impl Vote {
                 .filter_map(|landmark| self.method.get().verdict(landmark))
                 .collect()
         } else {
-            self.verdicts()
+            self.verdicts().collect()
         };
         VoteRound { verdicts, evidence }
     }
@@ -482,11 +482,10 @@ impl Vote {
     }
 
     /// The verdict of every landmark as of the last round, by landmark.
-    pub fn verdicts(&self) -> Vec<Verdict> {
+    pub fn verdicts(&self) -> impl Iterator<Item = Verdict> {
         self.landmarks
             .keys()
             .filter_map(|landmark| self.method.get().verdict(landmark))
-            .collect()
     }
 
     /// Re-evaluates the stored votes `passes` times, starting from equal trust; returns the verdict
@@ -494,7 +493,7 @@ impl Vote {
     ///
     /// This is Dawid & Skene (1979) with the priors of the online machine. It does not depend on
     /// the order of arrival. It has no effect in `paper` mode.
-    pub fn refine(&mut self, passes: u32) -> Vec<Verdict> {
+    pub fn refine(&mut self, passes: u32) -> impl Iterator<Item = Verdict> {
         self.method.get_mut().refine(passes);
         self.verdicts()
     }

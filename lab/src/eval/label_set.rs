@@ -192,10 +192,10 @@ impl LabelSet {
                 let observed = vote.observe(&report, now);
                 debug_assert_eq!(observed, Ok(()));
             }
-            take(&vote.close(now).verdicts, &mut online);
+            take(vote.close(now).verdicts, &mut online);
         }
         let mut refined = online.clone();
-        take(&vote.refine(passes), &mut refined);
+        take(vote.refine(passes), &mut refined);
         [online, refined]
     }
 
@@ -251,7 +251,7 @@ fn report(item: usize, answer: VoterAnswer, seq: u64, at: Timestamp) -> ObjectRe
 }
 
 /// Stores verdicts as decisions, by the numbers in the names of [`report`].
-fn take(verdicts: &[Verdict], decisions: &mut [ItemVerdict]) {
+fn take(verdicts: impl IntoIterator<Item = Verdict>, decisions: &mut [ItemVerdict]) {
     for verdict in verdicts {
         let item = verdict.landmark.as_str().parse::<usize>();
         let label = verdict.label.as_deref().map(str::parse::<usize>);

@@ -150,7 +150,7 @@ proptest! {
                 reports.iter().for_each(|report| vote.observe(report, now).unwrap());
                 vote.close(now);
             }
-            labels(&vote.verdicts())
+            labels(&vote.verdicts().collect::<Vec<_>>())
         };
         prop_assert_eq!(run(1.0), run(0.5f64.powi(power)));
     }

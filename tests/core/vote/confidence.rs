@@ -64,7 +64,7 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
                 .filter(|v| v.landmark.as_str() == item.to_string() && right(v, &truths))
                 .count();
         }
-        refined += vote.refine(10).iter().filter(|v| right(v, &truths)).count();
+        refined += vote.refine(10).filter(|v| right(v, &truths)).count();
     }
     let percent = |n: usize| 100.0 * n as f64 / (2 * ITEMS) as f64;
     (percent(online), percent(refined))

@@ -143,12 +143,13 @@ fn vote_on(items: &[Item]) -> Vote {
     vote
 }
 
-fn right(items: &[Item], verdicts: &[Verdict]) -> Vec<f64> {
-    assert_eq!(items.len(), verdicts.len());
-    let is_right = |(item, verdict): (&Item, &Verdict)| {
+fn right(items: &[Item], verdicts: impl Iterator<Item = Verdict>) -> Vec<f64> {
+    let is_right = |(item, verdict): (&Item, Verdict)| {
         f64::from(verdict.label.as_deref() == Some(format!("class-{}", item.truth).as_str()))
     };
-    items.iter().zip(verdicts).map(is_right).collect()
+    let right: Vec<f64> = items.iter().zip(verdicts).map(is_right).collect();
+    assert_eq!(right.len(), items.len());
+    right
 }
 
 /// The score of a kind over as many sets as have `items` items.
@@ -161,8 +162,8 @@ fn score(number: u64, items: usize) -> Score {
         let set = kind.generate(1000 * number + draw, items);
         draw += 1;
         let mut vote = vote_on(&set);
-        let one_pass = right(&set, &vote.verdicts());
-        let refined = right(&set, &vote.refine(PASSES));
+        let one_pass = right(&set, vote.verdicts());
+        let refined = right(&set, vote.refine(PASSES));
         for ((item, one_pass), refined) in set.iter().zip(one_pass).zip(refined) {
             let of_majority = chance_of_majority(item);
             majority.add(of_majority);

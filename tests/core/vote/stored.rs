@@ -45,7 +45,10 @@ fn who_corrects_an_answer_has_answered_once_and_is_believed_as_much_as_who_did_n
             .zip(labels)
             .for_each(|(seq, label)| say(&mut vote, "a", seq, &[("x", label)]));
         let online = on(&vote.close(AT).verdicts, "x").clone();
-        (online, on(&vote.refine(10), "x").clone())
+        (
+            online,
+            on(&vote.refine(10).collect::<Vec<_>>(), "x").clone(),
+        )
     };
     let once = answers(&["mouse"]);
     for labels in [
@@ -87,7 +90,7 @@ fn where_all_waver_the_votes_on_other_places_still_count() {
     ] {
         say(&mut vote, node, 3, &[("y", y), ("z", z)]);
     }
-    let verdicts = vote.refine(1);
+    let verdicts = vote.refine(1).collect::<Vec<_>>();
     let labels = ["y", "z"].map(|place| on(&verdicts, place).label.as_deref());
     assert_eq!(labels, [Some("cup"), Some("mouse")]);
     assert!(
