@@ -43,6 +43,15 @@ const FACTOR_STEPS: u32 = 15;
 /// Comparisons after which the counts of stated labels are halved.
 const SHARES_MEMORY: f64 = 10_000.0;
 
+/// A vote that is compared with the other votes on its landmark.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ComparedVote {
+    pub(super) vehicle: usize,
+    pub(super) label: LabelIndex,
+    /// Whether it has not been compared before.
+    pub(super) is_new: bool,
+}
+
 /// Fading counts of how often two vehicles voted on the same landmark and agreed.
 #[derive(Debug, Clone, Copy, Default)]
 struct Pair {
@@ -157,14 +166,13 @@ impl Dependence {
         }
     }
 
-    /// Compares the votes (vehicle, label, is new) on a landmark in pairs of which one is new;
-    /// their order is fixed.
-    pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
-        for &(vehicle, _, is_new) in votes {
-            if self.tenure.len() <= vehicle {
-                self.tenure.resize(vehicle + 1, 0.0);
+    /// Compares the votes on a landmark in pairs of which one is new; their order is fixed.
+    pub(super) fn compare(&mut self, votes: &[ComparedVote]) {
+        for vote in votes {
+            if self.tenure.len() <= vote.vehicle {
+                self.tenure.resize(vote.vehicle + 1, 0.0);
             }
-            self.tenure[vehicle] += f64::from(is_new);
+            self.tenure[vote.vehicle] += f64::from(vote.is_new);
         }
         let distances = votes.len() / 2;
         for step in 0..distances.min(self.max_compared) {
@@ -172,24 +180,27 @@ impl Dependence {
             let half_turn = 2 * distance == votes.len();
             for place in 0..if half_turn { distance } else { votes.len() } {
                 let (one, other) = (votes[place], votes[(place + distance) % votes.len()]);
-                if one.2 || other.2 {
-                    self.compare_pair((one.0, one.1), (other.0, other.1));
+                if one.is_new || other.is_new {
+                    self.compare_pair(one, other);
                 }
             }
         }
     }
 
-    fn compare_pair(&mut self, one: (usize, LabelIndex), other: (usize, LabelIndex)) {
-        self.count_label(one.1);
-        self.count_label(other.1);
+    fn compare_pair(&mut self, one: ComparedVote, other: ComparedVote) {
+        self.count_label(one.label);
+        self.count_label(other.label);
         let chance = self.squares / (self.total * self.total);
         let fade = 1.0 - 1.0 / self.memory;
         let pair = self
             .pairs
-            .entry((one.0.min(other.0), one.0.max(other.0)))
+            .entry((
+                one.vehicle.min(other.vehicle),
+                one.vehicle.max(other.vehicle),
+            ))
             .or_default();
         pair.compared = pair.compared * fade + 1.0;
-        pair.agreed = pair.agreed * fade + f64::from(one.1 == other.1);
+        pair.agreed = pair.agreed * fade + f64::from(one.label == other.label);
         pair.chance = pair.chance * fade + chance;
         self.compared += 1;
     }

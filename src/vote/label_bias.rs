@@ -17,6 +17,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::dependence::ComparedVote;
 use super::label_map::{LabelIndex, LabelMap};
 
 /// φ₀: the contingency of vehicles and labels up to which one accuracy per vehicle describes them
@@ -117,18 +118,19 @@ impl LabelBias {
         self.memory_votes = memory_votes;
     }
 
-    /// Counts the new votes (vehicle, label, is new) on a landmark against all others there.
-    pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
+    /// Counts the new votes on a landmark against all others there.
+    pub(super) fn compare(&mut self, votes: &[ComparedVote]) {
         if votes.len() < 2 {
             return;
         }
         let mut stated: LabelMap<f64> = LabelMap::default();
-        for (_, label, _) in votes {
-            *stated.entry(*label) += 1.0;
+        for vote in votes {
+            *stated.entry(vote.label) += 1.0;
         }
         let others = (votes.len() - 1) as f64;
         let fade = 1.0 - 1.0 / self.memory_votes;
-        for &(vehicle, stated_label, _) in votes.iter().filter(|(.., is_new)| *is_new) {
+        for vote in votes.iter().filter(|vote| vote.is_new) {
+            let vehicle = vote.vehicle;
             if self.vehicles.len() <= vehicle {
                 self.vehicles.resize(vehicle + 1, Preferences::default());
             }
@@ -140,7 +142,7 @@ impl LabelBias {
             preferences.votes += 1.0;
             preferences.squares += 1.0;
             for (label, &count) in stated.iter() {
-                let own = f64::from(u8::from(label == stated_label));
+                let own = f64::from(u8::from(label == vote.label));
                 preferences.add(label, own, (count - own) / others);
             }
             self.since += 1;
@@ -245,7 +247,11 @@ mod tests {
         let votes: Vec<_> = labels
             .iter()
             .enumerate()
-            .map(|(vehicle, &label)| (vehicle, label, true))
+            .map(|(vehicle, &label)| ComparedVote {
+                vehicle,
+                label,
+                is_new: true,
+            })
             .collect();
         bias.compare(&votes);
     }
@@ -284,7 +290,12 @@ mod tests {
             compare(&mut bias, &[first, truth, truth]);
         }
         for landmark in 0..8000u16 {
-            bias.compare(&[(0, landmark % 2, true), (1, landmark % 2, false)]);
+            let vote = |vehicle, is_new| ComparedVote {
+                vehicle,
+                label: landmark % 2,
+                is_new,
+            };
+            bias.compare(&[vote(0, true), vote(1, false)]);
         }
         assert!(bias.class_weight() < 0.1, "{}", bias.class_weight());
     }

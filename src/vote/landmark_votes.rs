@@ -1,7 +1,7 @@
 //! The votes on one landmark.
 
 use super::calibration::{Band, ConfidenceCalibration, Weights};
-use super::dependence::Dependence;
+use super::dependence::{ComparedVote, Dependence};
 use super::label_bias::LabelBias;
 use super::label_map::LabelIndex;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
@@ -155,9 +155,13 @@ impl LandmarkVotes {
             let mut votes: Vec<_> = self
                 .votes
                 .iter()
-                .map(|c| (c.vehicle, c.label, !c.compared))
+                .map(|c| ComparedVote {
+                    vehicle: c.vehicle,
+                    label: c.label,
+                    is_new: !c.compared,
+                })
                 .collect();
-            votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
+            votes.sort_by_key(|vote| order(vote.vehicle));
             dependence.compare(&votes);
             label_bias.compare(&votes);
             for vote in self.votes.iter_mut().filter(|c| !c.compared) {
