@@ -3,17 +3,21 @@
 
 mod intersection;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
+use ecod::model::names::NodeName;
+use ecod::wire::{ObjectReport, ReportKind};
 use ecod_actors::cli::{Failure, lines, print};
 use ecod_actors::platform::bounded_file;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::write_json;
+use crate::testbed::intersection::line;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 use crate::testbed::trial::Trial;
@@ -41,7 +45,8 @@ pub(super) struct TestbedArguments {
     /// Frames in each generated scene
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u16).range(1..))]
     pub(super) frames: u16,
-    /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
+    /// Write the vehicles' reports to this file, as `replay` reads them; parking lots also need
+    /// `--scene`
     #[arg(long, value_name = "FILE")]
     pub(super) reports: Option<PathBuf>,
     /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded
@@ -79,10 +84,9 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     if serde_json::from_str(&text).is_ok_and(|file| IntersectionRecording::is_recording(&file)) {
         return intersection::run(arguments, &text);
     }
-    if arguments.reports.is_some() {
-        let scenes = arguments.scenes.display();
+    if arguments.reports.is_some() && arguments.scene.is_none() {
         return Err(Failure::usage(anyhow!(
-            "--reports is for recorded detections, and {scenes} has scenes to render"
+            "--reports holds the reports of one parking lot: name it by --scene"
         )));
     }
     let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
@@ -100,11 +104,13 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         };
         let frames = trial.frames_per_verdict() * arguments.verdicts * scene.cavs.len() as u64;
         let bar = progress(frames, &scene.name);
-        results.push(
-            trial
-                .run(|| bar.inc(1))
-                .with_context(|| format!("scene {}", scene.name))?,
-        );
+        let reports = trial
+            .reports(&|| bar.inc(1))
+            .with_context(|| format!("scene {}", scene.name))?;
+        if let Some(file) = &arguments.reports {
+            write_reports(file, &reports)?;
+        }
+        results.push(trial.run(&reports));
         bar.finish_and_clear();
         // After each scene: finished results are kept, even if a later scene fails.
         if let Some(out) = &arguments.out {
@@ -131,6 +137,21 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         }
     }
     Ok(())
+}
+
+/// Writes the reports of all vehicles in the order of capture.
+fn write_reports(
+    path: &Path,
+    reports: &BTreeMap<NodeName, Vec<ObjectReport>>,
+) -> anyhow::Result<()> {
+    let mut reports: Vec<_> = reports.values().flatten().collect();
+    reports.sort_by_key(|report| report.captured_at_us);
+    let mut text = String::new();
+    for report in reports {
+        text += &line(report, ReportKind::Detections)?;
+        text.push('\n');
+    }
+    fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Reads a scene file.

@@ -38,12 +38,8 @@ pub struct Trial<'a> {
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
 impl Trial<'_> {
-    /// Runs the scene on all cores; `progress` is called for every processed frame.
-    ///
-    /// # Errors
-    /// Returns an error if a part of the pipeline cannot be built or a frame cannot be rendered.
-    pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
-        let reports = self.reports(&progress)?;
+    /// Fuses the reports of the scene's vehicles and evaluates the maps.
+    pub fn run(&self, reports: &BTreeMap<NodeName, Vec<ObjectReport>>) -> SceneResult {
         let mut fused = self.aggregator(Algorithms::Pace);
         let (mut voting, mut agreeing) = (
             self.aggregator(Algorithms::Vote),
@@ -70,7 +66,7 @@ impl Trial<'_> {
             ] {
                 self.judge(aggregator, all.clone(), score);
             }
-            for (name, cav) in &reports {
+            for (name, cav) in reports {
                 if let Some((aggregator, score)) = alone.get_mut(name) {
                     self.judge(aggregator, of_verdict(cav), score);
                 }
@@ -83,11 +79,11 @@ impl Trial<'_> {
         let result = SceneResult::new(self.testbed, self.scene, self.verdicts, &score, &alone);
         let [vote_accuracy_pct, answer_accuracy_pct] =
             [votes, answers].map(|score| Some(score.accuracy_pct()));
-        Ok(SceneResult {
+        SceneResult {
             vote_accuracy_pct,
             answer_accuracy_pct,
             ..result
-        })
+        }
     }
 
     /// Fuses one verdict's reports and evaluates the result.
@@ -115,8 +111,12 @@ impl Trial<'_> {
         (frames.round() as u64).max(1)
     }
 
-    /// Every vehicle's reports, one for each frame.
-    fn reports(
+    /// Every vehicle's reports, one for each frame, computed on all cores. `progress` is called for
+    /// every processed frame.
+    ///
+    /// # Errors
+    /// Returns an error if a part of the pipeline cannot be built or a frame cannot be rendered.
+    pub fn reports(
         &self,
         progress: &(impl Fn() + Sync),
     ) -> anyhow::Result<BTreeMap<NodeName, Vec<ObjectReport>>> {
