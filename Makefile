@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -65,10 +65,18 @@ testbed: setup ## accuracy on the recorded parking lots, rendered and detected, 
 	$(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
-eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
-	cargo build --release --locked --bin ecod-node --bin ecod-lab
-	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
-	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
+# OPTIONS="--seconds 20" takes other options of packaging/compare.
+compare: PACKAGES += binutils mosquitto python3-venv
+compare: setup ## [measure] ECOD beside the paper's way in Python: latency, costs, gap, accuracy; writes the table in docs/results.md
+	packaging/compare $(or $(OPTIONS),--write-table docs/results.md)
+
+eval-labels: setup ## accuracy of VOTE on label sets; the tables go into docs/results.md
+	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-lab
+	cargo run --quiet --locked --example eval_labels -- --program $(PROGRAMS)/ecod-node --sets "$(SETS)" --passes $(PASSES) \
+	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/results.md)
+
+results-check: eval-labels ## fails if the tables of label sets in docs/results.md differ from the measured ones
+	git diff --exit-code docs/results.md
 
 compare-labels: PACKAGES += python3-venv
 compare-labels: setup ## VOTE beside the methods of crowd-kit, from PyPI, on label sets; SETS=DIR
@@ -79,11 +87,11 @@ eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 
 eval-tracks: setup ## [measure] tracking in generated traffic beside single vehicles and late fusion; writes table and drawings in docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
-	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg --reliability docs/reliability.svg)
+	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/results.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
-# DIR holds copies of the repositories that docs/measurements.md names; the program names missing ones.
+# DIR holds copies of the repositories that docs/evaluation.md names; the program names missing ones.
 eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
-	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/measurements.md names"; exit 2; }
+	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/evaluation.md names"; exit 2; }
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
 	@status=0; \
 	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real || status=1; \
@@ -92,8 +100,8 @@ eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI
 	        --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || status=1; \
 	done; exit $$status
 
-eval-city: setup ## nine cells in generated traffic beside one aggregator over everything; the table goes into docs/evaluation.md
-	cargo run --release --quiet --locked --example eval_city -- --write-table docs/evaluation.md
+eval-city: setup ## nine cells in generated traffic beside one aggregator over everything; the table goes into docs/results.md
+	cargo run --release --quiet --locked --example eval_city -- --write-table docs/results.md
 
 eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI
@@ -237,7 +245,7 @@ deb: setup ## [release] Debian packages with camera, without camera, and of the 
 	packaging/deb
 
 deb-arm64: PACKAGES += debootstrap systemd-container
-deb-arm64: setup ## [release] these packages for arm64, built in a Debian in target/arm64-root; needs root
+deb-arm64: setup ## these packages for arm64, built in a Debian in target/arm64-root; needs root
 	packaging/arm64 packaging/deb
 
 package-check-arm64: PACKAGES += mosquitto-clients python3 qrencode
@@ -285,9 +293,9 @@ instructions-arm64: setup ## instructions of core and detectors on arm64 beside 
 	packaging/arm64 cargo build --release --locked --target aarch64-unknown-linux-gnu -p ecod-instructions --features detectors --bin ecod-work
 	packaging/count-arm64 $(BUILD)/release/ecod-work target/arm64/aarch64-unknown-linux-gnu/release/ecod-work
 
-liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/vote.md, drawing in target/liars.svg; SEEDS=n only checks
+liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/results.md, drawing in target/liars.svg; SEEDS=n only checks
 	mkdir -p target
-	cargo run --profile $(PROFILE) --locked --example liars -- $(if $(SEEDS),--seeds $(SEEDS),--write-table docs/vote.md --svg target/liars.svg)
+	cargo run --profile $(PROFILE) --locked --example liars -- $(if $(SEEDS),--seeds $(SEEDS),--write-table docs/results.md --svg target/liars.svg)
 
 clean: ## remove everything that was built
 	cargo clean

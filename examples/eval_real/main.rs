@@ -3,7 +3,7 @@
 //!
 //! `make eval-real DIR=…`, or `cargo run --example eval_real -- --program target/release/ecod-node --data DIR [--work DIR]`
 //!
-//! DIR holds copies of public repositories, named as they are there; `docs/measurements.md` has the list. What is missing
+//! DIR holds copies of public repositories, named as they are there; `docs/evaluation.md` has the list. What is missing
 //! is named, and makes the program fail after all others were judged.
 
 mod foot_points;
