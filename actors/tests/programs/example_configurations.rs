@@ -184,6 +184,165 @@ fn the_documentation_names_every_key() {
     }
 }
 
+/// A key in the tables of docs/configuration.md with its default and allowed range, as written.
+#[cfg(feature = "camera")]
+struct DocumentedKey {
+    key: String,
+    default: String,
+    range: Option<(String, String)>,
+}
+
+/// The rows of docs/configuration.md that describe one key.
+#[cfg(feature = "camera")]
+fn documented_keys(manual: &str) -> Vec<DocumentedKey> {
+    let mut section = "";
+    let mut keys = Vec::new();
+    let (_, reference) = manual.split_once("\n## Keys\n").unwrap();
+    for line in reference.lines() {
+        if let Some(heading) = line.strip_prefix("## `[") {
+            section = heading.split(']').next().unwrap();
+        }
+        let cells: Vec<&str> = line.split(" | ").collect();
+        let (Some(key), Some(value)) = (cells[0].strip_prefix("| `"), cells.get(1)) else {
+            continue;
+        };
+        let key = key.trim_end_matches('`');
+        if key.contains('`') {
+            continue;
+        }
+        let (default, rest) = value.split_once(" (").unwrap_or((value, ""));
+        let range = rest.trim_end_matches(')').split_once('–');
+        keys.push(DocumentedKey {
+            key: [section, key]
+                .iter()
+                .filter(|part| !part.is_empty())
+                .copied()
+                .collect::<Vec<_>>()
+                .join("."),
+            default: default.to_owned(),
+            range: range.map(|(low, high)| (low.to_owned(), high.to_owned())),
+        });
+    }
+    keys
+}
+
+/// The number that a table of the manual states, such as `60,000`, `10⁻⁶` or `4.0 nats`; `None` for
+/// names and texts.
+#[cfg(feature = "camera")]
+fn documented_number(text: &str) -> Option<f64> {
+    let text = text.split(' ').next()?.replace(',', "");
+    if text == "π" {
+        return Some(std::f64::consts::PI);
+    }
+    let Some(exponent) = text.strip_prefix("10").filter(|rest| {
+        rest.starts_with(|first: char| SUPERSCRIPTS.contains(first) || first == '⁻')
+    }) else {
+        return text.parse().ok();
+    };
+    let digits = exponent.chars().map(|digit| match digit {
+        '⁻' => '-',
+        digit => SUPERSCRIPTS
+            .chars()
+            .position(|other| other == digit)
+            .and_then(|value| char::from_digit(value as u32, 10))
+            .unwrap(),
+    });
+    Some(10f64.powi(digits.collect::<String>().parse().unwrap()))
+}
+
+#[cfg(feature = "camera")]
+const SUPERSCRIPTS: &str = "⁰¹²³⁴⁵⁶⁷⁸⁹";
+
+/// Loads a configuration that sets one key, with the camera that keys of `[camera]` need.
+#[cfg(feature = "camera")]
+fn load_with(key: &str, value: &str) -> Result<NodeConfig, String> {
+    let mut file = tempfile::NamedTempFile::new().unwrap();
+    let camera = "camera.source.kind = \"v4l2\"\ncamera.detector.kind = \"coco\"";
+    writeln!(file, "name = \"n\"\n{camera}\n{key} = {value}").unwrap();
+    NodeConfig::load(Some(file.path()), &BTreeMap::<(), ()>::new())
+        .map_err(|error| error.to_string())
+}
+
+#[cfg(feature = "camera")]
+#[test]
+fn documented_defaults_and_ranges_are_those_of_the_code() {
+    let camera = load_with("cell", "\"cell\"").unwrap();
+    let defaults: toml::Table = camera.to_toml().unwrap().parse().unwrap();
+    let (mut defaults_checked, mut bounds_checked) = (0, 0);
+    let mut faults = Vec::new();
+    for DocumentedKey {
+        key,
+        default,
+        range,
+    } in documented_keys(&page("docs/configuration.md"))
+    {
+        let value = key
+            .split('.')
+            .try_fold(&toml::Value::Table(defaults.clone()), |table, part| {
+                table.get(part)
+            })
+            .cloned();
+        let default_number = documented_number(&default);
+        let actual = match &value {
+            Some(toml::Value::Integer(number)) => Some(*number as f64),
+            Some(toml::Value::Float(number)) => Some(*number),
+            _ => None,
+        };
+        if let (Some(documented), Some(actual)) = (default_number, actual) {
+            if (documented - actual).abs() > 0.005 * actual.abs() {
+                faults.push(format!(
+                    "default of `{key}`: {documented}, the code has {actual}"
+                ));
+            }
+            defaults_checked += 1;
+        }
+        let Some((low, high)) = range else { continue };
+        let is_whole = matches!(value, Some(toml::Value::Integer(_)));
+        let written = |number: f64| {
+            if is_whole {
+                format!("{}", number.round())
+            } else {
+                format!("{number:?}")
+            }
+        };
+        let step = |number: f64| {
+            if is_whole {
+                1.0
+            } else {
+                (0.01 * number.abs()).max(1e-9)
+            }
+        };
+        // Errors that state no range come from a relation to another key.
+        let names_range =
+            |error: String| error.contains(&format!("`{key}`")) && error.contains("a number from");
+        let is_refused = |number: f64| load_with(&key, &written(number)).is_err_and(names_range);
+        for (bound, beyond) in [(low, -1.0), (high, 1.0)] {
+            let Some(bound) = documented_number(&bound).filter(|_| actual.is_some()) else {
+                continue;
+            };
+            let outside = bound + beyond * step(bound);
+            if is_refused(bound) {
+                faults.push(format!("`{key}` allows {bound}, the code refuses it"));
+            }
+            if load_with(&key, &written(outside)).is_ok() {
+                faults.push(format!(
+                    "`{key}` ends at {bound}, the code allows {outside}"
+                ));
+            }
+            bounds_checked += 1;
+        }
+    }
+    assert!(
+        faults.is_empty(),
+        "docs/configuration.md differs from the code:\n{}",
+        faults.join("\n")
+    );
+    assert!(
+        defaults_checked > 80 && bounds_checked > 130,
+        "only {defaults_checked} defaults and {bounds_checked} bounds found"
+    );
+}
+
 #[test]
 fn links_in_the_documentation_lead_somewhere() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
