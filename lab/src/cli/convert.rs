@@ -10,7 +10,7 @@ use ecod::model::names::NodeName;
 use ecod_actors::cli::{Failure, lines};
 
 use super::files::{camera, frame_rate, read};
-use crate::eval::formats::{FileFormat, check_lengths};
+use crate::eval::formats::{FileContext, FileFormat, check_lengths};
 
 /// Flags of `convert`.
 #[derive(Debug, Args)]
@@ -76,7 +76,12 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
             .iter()
             .find(|(of, _)| of == name)
             .map(|(_, path)| path.as_path());
-        of_vehicles.push((name, read(*format, path, camera(config)?.as_ref())?));
+        let camera = camera(config)?;
+        let context = FileContext {
+            camera: camera.as_ref(),
+            categories: None,
+        };
+        of_vehicles.push((name, read(*format, path, context)?));
     }
     // A vehicle's only file is the first sequence, whatever its name, if no vehicle has several.
     let all = || of_vehicles.iter().flat_map(|(_, sequences)| sequences);

@@ -2,6 +2,7 @@
 
 mod tracks;
 
+use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -137,6 +138,13 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
                 .find_map(|(n, o)| Some((n, o.validate().err()?)))
         {
             return unreadable.add(number, format!("objects[{place}]: {reason}"));
+        }
+        if let FusedLine::Map(GlobalMap { objects, .. }) = &line {
+            let mut ids = BTreeSet::new();
+            if let Some(place) = objects.iter().position(|object| !ids.insert(object.id)) {
+                let fault = format!("objects[{place}].id: is in this map already");
+                return unreadable.add(number, fault);
+            }
         }
         take(line);
         read += 1;

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 use ecod_actors::cli::Failure;
 
-use crate::eval::formats::{FileFormat, Sequence, StandingCamera};
+use crate::eval::formats::{FileContext, FileFormat, Sequence, StandingCamera};
 
 /// Parses frames a second.
 pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
@@ -24,17 +24,26 @@ pub(super) fn camera(config: Option<&Path>) -> Result<Option<StandingCamera>, Fa
     config.map(load).transpose().map_err(Failure::usage)
 }
 
-/// Reads a file, or all of a directory, and prints which boxes have no place.
+/// Reads a file, or all of a directory, and prints which entries are not used.
 pub(super) fn read(
     format: FileFormat,
     path: &Path,
-    camera: Option<&StandingCamera>,
+    context: FileContext<'_>,
 ) -> Result<Vec<Sequence>, Failure> {
-    let sequences = format.read(path, camera).map_err(Failure::usage)?;
+    let sequences = format.read(path, context).map_err(Failure::usage)?;
     for Sequence {
-        name, discarded, ..
+        name,
+        discarded,
+        skipped,
+        ..
     } in &sequences
     {
+        if skipped.count > 0 {
+            eprintln!(
+                "{name}: {} entries cannot be used, the first is {}",
+                skipped.count, skipped.first
+            );
+        }
         for (reason, boxes) in discarded {
             eprintln!("{name}: {boxes} boxes have no place on the ground: {reason}");
         }

@@ -24,6 +24,7 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use ecod_actors::platform::bounded_file;
+use hashbrown::HashMap;
 use nalgebra::Point2;
 
 pub use standing_camera::StandingCamera;
@@ -57,6 +58,8 @@ pub struct FileObject {
 /// An object as stated in its file.
 #[derive(Debug, Clone, PartialEq)]
 struct ParsedObject {
+    /// Its line from 1, or its place in a list from 0.
+    entry: usize,
     id: Option<i64>,
     label: Label,
     /// Confidence, 0 to 1 unless it is log-odds; of truth, 1.
@@ -75,6 +78,43 @@ enum FilePlace {
 /// The objects of every frame that has any, or that the file lists, by its number.
 type ParsedFrames = BTreeMap<u64, Vec<ParsedObject>>;
 
+/// A file as read.
+#[derive(Debug, Default)]
+struct ParsedFile {
+    frames: ParsedFrames,
+    skipped: SkippedEntries,
+}
+
+/// Entries of a file that state no usable object.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SkippedEntries {
+    /// How many.
+    pub count: u64,
+    /// The first with its fault.
+    pub first: String,
+}
+
+impl SkippedEntries {
+    fn add(&mut self, fault: String) {
+        if self.count == 0 {
+            self.first = fault;
+        }
+        self.count += 1;
+    }
+}
+
+/// Names of the categories of datasets in the form of COCO, by their numbers.
+pub type Categories = BTreeMap<i64, Label>;
+
+/// The vehicle's camera and the dataset that files belong to.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct FileContext<'a> {
+    /// The camera that saw the boxes.
+    pub camera: Option<&'a StandingCamera>,
+    /// The categories of results in the form of COCO. Default: COCO's own.
+    pub categories: Option<&'a Categories>,
+}
+
 /// The objects of every frame that has any, by its number.
 pub type Frames = BTreeMap<u64, Vec<FileObject>>;
 
@@ -91,6 +131,8 @@ pub struct Sequence {
     pub pose: Option<WirePose>,
     /// Boxes without a place on the ground, by reason.
     pub discarded: BTreeMap<&'static str, u64>,
+    /// Entries that state no usable object.
+    pub skipped: SkippedEntries,
 }
 
 impl Sequence {
@@ -168,31 +210,51 @@ impl FileFormat {
         }
     }
 
-    /// Reads a file, or all files of a directory with the extension of the format. Boxes are seen
-    /// by `camera`.
+    /// The categories that the datasets in these files state, if any.
+    ///
+    /// # Errors
+    /// Returns an error that names the file, also if datasets use a number for several categories.
+    pub fn categories(self, path: &Path) -> anyhow::Result<Option<Categories>> {
+        if self != Self::Coco {
+            return Ok(None);
+        }
+        let mut categories = Categories::new();
+        for file in self.files(path)? {
+            let of_file =
+                coco::categories(&text_of(&file)?).with_context(|| file.display().to_string())?;
+            for (id, name) in of_file {
+                let known = categories.entry(id).or_insert_with(|| name.clone());
+                if *known != name {
+                    let file = file.display();
+                    bail!("{file}: category {id} is {name}, and {known} in another file");
+                }
+            }
+        }
+        Ok(Some(categories).filter(|categories| !categories.is_empty()))
+    }
+
+    /// Reads a file, or all files of a directory with the extension of the format.
     ///
     /// # Errors
     /// Returns an error that names file, line and field.
     pub fn read(
         self,
         path: &Path,
-        camera: Option<&StandingCamera>,
+        FileContext { camera, categories }: FileContext<'_>,
     ) -> anyhow::Result<Vec<Sequence>> {
         if self == Self::Kitti && camera.is_some() {
             bail!("positions of KITTI are those of its vehicle: they need no --config");
         }
         let files = self.files(path)?;
         let parse = |file: &PathBuf| {
-            let text = bounded_file::read_text(file)
-                .with_context(|| format!("cannot read {}", file.display()))?;
-            self.parse(&text, camera.is_some())
+            self.parse(&text_of(file)?, camera.is_some(), categories)
                 .with_context(|| file.display().to_string())
         };
         let mut parsed = files
             .iter()
             .map(parse)
             .collect::<anyhow::Result<Vec<_>>>()?;
-        as_probabilities(&mut parsed);
+        self.as_probabilities(&files, &mut parsed)?;
         Ok(files
             .iter()
             .zip(parsed)
@@ -203,7 +265,10 @@ impl FileFormat {
     fn sequence(
         self,
         file: &Path,
-        parsed: ParsedFrames,
+        ParsedFile {
+            frames: parsed,
+            skipped,
+        }: ParsedFile,
         camera: Option<&StandingCamera>,
     ) -> Sequence {
         let name = file
@@ -222,21 +287,28 @@ impl FileFormat {
             frames: Frames::new(),
             pose: None,
             discarded: BTreeMap::new(),
+            skipped,
         };
         standing_camera::placed(parsed, camera, sequence)
     }
 
     /// Reads the text of a file; a file with boxes needs a camera.
-    fn parse(self, text: &str, has_camera: bool) -> anyhow::Result<ParsedFrames> {
-        let text = text.trim_start_matches('\u{feff}');
+    fn parse(
+        self,
+        text: &str,
+        has_camera: bool,
+        categories: Option<&Categories>,
+    ) -> anyhow::Result<ParsedFile> {
         Ok(match self {
-            Self::Coco => coco::frames(text, has_camera)?,
+            Self::Coco => coco::frames(text, has_camera, categories)?,
             _ => self.lines(text, has_camera)?,
         })
     }
 
-    fn lines(self, text: &str, has_camera: bool) -> Result<ParsedFrames, LineError> {
-        let mut frames = ParsedFrames::new();
+    fn lines(self, text: &str, has_camera: bool) -> Result<ParsedFile, LineError> {
+        let mut parsed = ParsedFile::default();
+        let mut tracks = HashMap::new();
+        let mut without_area = None;
         for (number, line) in text
             .lines()
             .enumerate()
@@ -249,6 +321,20 @@ impl FileFormat {
                 mot::object(&cells, has_camera)?
             };
             if let Some((frame, object)) = object {
+                if let FilePlace::Image(image) = object.place
+                    && !image.is_valid()
+                {
+                    let fault = cells.error(5, "width", "and height are of no box".into());
+                    parsed.skipped.add(fault.to_string());
+                    without_area.get_or_insert(fault);
+                    continue;
+                }
+                if let Some(id) = object.id
+                    && let Some(first) = tracks.insert((frame, id), number + 1)
+                {
+                    let fault = format!("{id} is in frame {frame} already, in line {first}");
+                    return Err(cells.error(2, "track", fault));
+                }
                 if let FilePlace::Ground(place) = object.place
                     && let Err((field, _)) =
                         PerceivedObject::new(object.label.clone(), 1.0, place.x, place.y)
@@ -261,12 +347,56 @@ impl FileFormat {
                         fault,
                     });
                 }
-                frames.entry(frame).or_default().push(object);
+                parsed.frames.entry(frame).or_default().push(object);
             }
         }
-        Ok(frames)
+        match without_area.filter(|_| parsed.frames.is_empty()) {
+            Some(error) => Err(error),
+            None => Ok(parsed),
+        }
+    }
+
+    /// Turns log-odds into probabilities if the files have them: many scores are then outside of 0
+    /// to 1. A few such scores are faults, unless they are errors of rounding.
+    fn as_probabilities(self, names: &[PathBuf], files: &mut [ParsedFile]) -> anyhow::Result<()> {
+        let is_probability = |score: f64| (0.0..=1.0).contains(&score);
+        let all = || files.iter().flat_map(|file| file.frames.values()).flatten();
+        let count = all().count();
+        let outside = all().filter(|o| !is_probability(o.score)).count();
+        let are_log_odds = outside as f64 >= LOG_ODDS_SHARE * count as f64;
+        for (name, file) in names.iter().zip(files).filter(|_| outside > 0) {
+            for ParsedObject { entry, score, .. } in file.frames.values_mut().flatten() {
+                if are_log_odds {
+                    *score = 1.0 / (1.0 + (-compressed(*score)).exp());
+                    continue;
+                }
+                let clamped = score.clamp(0.0, 1.0);
+                if (*score - clamped).abs() > ROUNDING {
+                    let place = match self {
+                        Self::Coco => format!("entry [{entry}]"),
+                        Self::Kitti | Self::Mot => format!("line {entry}"),
+                    };
+                    bail!(
+                        "{}: {place}: score {score} is not within 0 to 1, where all but {outside} of {count} are: correct it, or state log-odds for all",
+                        name.display()
+                    );
+                }
+                *score = clamped;
+            }
+        }
+        Ok(())
     }
 }
+
+fn text_of(file: &Path) -> anyhow::Result<String> {
+    bounded_file::read_text(file).with_context(|| format!("cannot read {}", file.display()))
+}
+
+/// Least share of scores outside of 0 to 1 by which all scores are log-odds.
+const LOG_ODDS_SHARE: f64 = 0.1;
+
+/// Most by which a probability is outside of 0 to 1 after calculations with 32-bit numbers.
+const ROUNDING: f64 = 1e-3;
 
 /// The number of a frame, if it is plausible. All frames up to the last make a report, also those
 /// without objects.
@@ -309,17 +439,6 @@ pub fn check_lengths<'a>(
 /// probabilities would be too close to 1 to be distinguished.
 const LARGE_LOG_ODDS: f64 = 20.0;
 const MAX_LOG_ODDS: f64 = 30.0;
-
-/// If any score is outside 0 to 1, all scores are interpreted as log-odds. Their order is kept.
-fn as_probabilities(files: &mut [ParsedFrames]) {
-    let objects = files.iter_mut().flat_map(BTreeMap::values_mut).flatten();
-    let mut scores: Vec<&mut f64> = objects.map(|object| &mut object.score).collect();
-    if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
-        scores
-            .iter_mut()
-            .for_each(|score| **score = 1.0 / (1.0 + (-compressed(**score)).exp()));
-    }
-}
 
 fn compressed(log_odds: f64) -> f64 {
     let beyond = (log_odds.abs() - LARGE_LOG_ODDS).max(0.0) / LARGE_LOG_ODDS;

@@ -20,7 +20,7 @@ mod precision;
 mod tests;
 mod truth;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use ecod::model::names::Label;
 use ecod::model::time::Timestamp;
@@ -235,6 +235,17 @@ fn at_threshold(frames: &[ScoredFrame], threshold: f64) -> ThresholdScores {
     }
 }
 
+/// The first names of a set, in quotes.
+fn listed(labels: &BTreeSet<&Label>) -> String {
+    const SHOWN: usize = 5;
+    let names = labels.iter().take(SHOWN).map(|label| format!("{label:?}"));
+    let names = names.collect::<Vec<_>>().join(", ");
+    match labels.len().saturating_sub(SHOWN) {
+        0 => names,
+        more => format!("{names} and {more} more"),
+    }
+}
+
 /// Evaluates the maps of a replay; see the module.
 ///
 /// A map states the positions of objects at its `fused_at_us`. A frame is evaluated by the nearest
@@ -287,6 +298,18 @@ impl TrackEvaluation {
                 *nearest = Some((at, said.to_owned()));
             }
         }
+    }
+
+    /// The classes of the reported objects and those of the truth, if both have some and none in
+    /// common.
+    pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
+        let said = self.maps.iter().flatten().flat_map(|(_, said)| said);
+        let said: BTreeSet<&Label> = said.map(|object| &object.label).collect();
+        let frames = self.truth.frames().iter();
+        let truth = frames.flat_map(|frame| &frame.objects);
+        let truth: BTreeSet<&Label> = truth.map(|object| &object.label).collect();
+        let are_apart = !said.is_empty() && !truth.is_empty() && said.is_disjoint(&truth);
+        are_apart.then(|| (listed(&said), listed(&truth)))
     }
 
     /// The figures.

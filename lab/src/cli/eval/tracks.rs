@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::{EvalArguments, columns, read_output, write_json};
 use crate::cli::files;
-use crate::eval::formats::{FileFormat, check_lengths, sequence_at, time_of};
+use crate::eval::formats::{FileContext, FileFormat, check_lengths, sequence_at, time_of};
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
@@ -40,7 +40,12 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
         ..
     } = arguments;
     let camera = files::camera(config.as_deref())?;
-    let read = |path: &Path| files::read(format, path, camera.as_ref());
+    let categories = format.categories(path).map_err(Failure::usage)?;
+    let context = FileContext {
+        camera: camera.as_ref(),
+        categories: categories.as_ref(),
+    };
+    let read = |path: &Path| files::read(format, path, context);
     let mut truth = read(path)?;
     let said = if is_of_maps(input)? {
         None
@@ -135,6 +140,13 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
         return Err(Failure::usage(anyhow!(
             "--reports and --config are for a truth of locations"
         )));
+    }
+    if let Some((said, truth)) = evaluation.labels_that_never_meet() {
+        eprintln!(
+            "no object of {} has a class of {}: {said} there, {truth} in the truth; classes count by their exact names",
+            arguments.input.display(),
+            arguments.truth.display()
+        );
     }
     let scores = evaluation.result();
     if scores.frames_with_map == 0 {

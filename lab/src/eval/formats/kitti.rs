@@ -42,6 +42,7 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
         return Ok(Some((
             frame,
             ParsedObject {
+                entry: cells.line,
                 id: None,
                 label,
                 score,
@@ -49,7 +50,7 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
             },
         )));
     }
-    let id = cells.integer(2, "track")?;
+    let id = Some(cells.integer(2, "track")?).filter(|id| *id >= 0);
     let class = cells.text(3, "type")?;
     let Some(label) = CLASSES.into_iter().find(|known| *known == class) else {
         return Ok(None);
@@ -63,7 +64,8 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
     Ok(Some((
         frame,
         ParsedObject {
-            id: Some(id),
+            entry: cells.line,
+            id,
             label: Label::new_static(label),
             score,
             place: place(14)?,

@@ -42,6 +42,7 @@ pub(super) fn object(
     };
     let is_ignored = id.is_some() && score == 0.0;
     let object = ParsedObject {
+        entry: cells.line,
         id,
         label: Label::new_static("person"),
         score,
@@ -60,15 +61,10 @@ fn ground(cells: &Cells) -> Result<Option<Point2<f64>>, LineError> {
 
 fn image(cells: &Cells) -> Result<BoundingBox, LineError> {
     let (x_min, y_min) = (cells.number(3, "left")?, cells.number(4, "top")?);
-    let image = BoundingBox {
+    Ok(BoundingBox {
         x_min,
         y_min,
         x_max: x_min + cells.number(5, "width")?,
         y_max: y_min + cells.number(6, "height")?,
-    };
-    if image.is_valid() {
-        Ok(image)
-    } else {
-        Err(cells.error(5, "width", "and height are of no box".into()))
-    }
+    })
 }

@@ -57,6 +57,7 @@ pub(super) fn placed(
             label,
             score,
             place,
+            ..
         } in objects
         {
             match place {

@@ -33,7 +33,11 @@ fn read(
     let folder = TempDir::new()?;
     let file = folder.path().join("file");
     fs::write(&file, text)?;
-    Ok(format.read(&file, camera)?.remove(0))
+    let context = FileContext {
+        camera,
+        categories: None,
+    };
+    Ok(format.read(&file, context)?.remove(0))
 }
 
 /// A camera 4 m up that looks north from (10, -5), level; a pixel is 1/500 ahead.
@@ -255,4 +259,125 @@ fn what_cannot_be_read_of_coco_is_named_by_its_path() {
             .to_string();
         assert!(said.starts_with(fault), "{text}: {said}");
     }
+}
+
+#[test]
+fn an_identity_is_once_in_a_frame() {
+    let mot =
+        "1,7,912,484,97,109,1,4,5,0\n2,7,912,484,97,109,1,4,5,0\n2,7,912,484,97,109,1,6,5,0\n";
+    let kitti =
+        "0 3 Car 0 0 -1.7 296.7 161.7 455.2 292.3 1.5 1.6 3.9 -4.5 1.8 13.4 -2.1\n".repeat(2);
+    let coco = format!(
+        "[{0}, {0}]",
+        format_args!(
+            r#"{{"image_id": 8, "category_id": 3, "bbox": {BOX_AT_12_15}, "track_id": 4}}"#
+        )
+    );
+    let camera = camera();
+    for (format, text, camera, fault) in [
+        (
+            FileFormat::Mot,
+            mot,
+            None,
+            "line 3: column 2 (track): 7 is in frame 2 already, in line 2",
+        ),
+        (
+            FileFormat::Kitti,
+            &kitti,
+            None,
+            "line 2: column 2 (track): 3 is in frame 0 already, in line 1",
+        ),
+        (
+            FileFormat::Coco,
+            &coco,
+            Some(&camera),
+            "[1].track_id: 4 is in image 8 already, in [0]",
+        ),
+    ] {
+        let error = read(format, text, camera).unwrap_err();
+        assert_eq!(error.root_cause().to_string(), fault);
+    }
+    let detections = kitti.replace(" 3 Car", " -1 Car");
+    let frames = read(FileFormat::Kitti, &detections, None).unwrap().frames;
+    assert!(frames[&0].iter().all(|object| object.id.is_none()));
+}
+
+#[test]
+fn one_odd_score_does_not_change_the_others() {
+    let line = |frame: u32, score: &str| format!("{frame},-1,1,2,3,4,{score},1.5,2.5,0\n");
+    let lines =
+        |last: &str| (1..=20).map(|frame| line(frame, "0.9")).collect::<String>() + &line(21, last);
+    let frames = read(FileFormat::Mot, &lines("1.0000001"), None)
+        .unwrap()
+        .frames;
+    let scores = positions(&frames).into_iter().map(|row| row.3);
+    assert!(scores.eq([0.9; 20].into_iter().chain([1.0])));
+    for odd in ["1.7", "-0.2", "97"] {
+        let error = read(FileFormat::Mot, &lines(odd), None)
+            .unwrap_err()
+            .to_string();
+        let fault = format!("line 21: score {odd} is not within 0 to 1, where all but 1 of 21 are");
+        assert!(error.contains(&fault), "{error}");
+    }
+}
+
+#[test]
+fn entries_without_area_are_counted_and_the_others_read() {
+    let camera = camera();
+    let coco = format!(
+        r#"{{"images": [{{"id": 8}}], "categories": [{{"id": 1, "name": "van"}}], "annotations": [
+            {{"image_id": 8, "category_id": 1, "bbox": [10.0, 10.0, 0.0, 5.0]}},
+            {{"image_id": 8, "category_id": 1, "bbox": {BOX_AT_12_15}}},
+            {{"image_id": 8, "category_id": 9, "bbox": {BOX_AT_12_15}}}]}}"#
+    );
+    let mot = "8,-1,540,450,0,50,0.5\n8,-1,540,450,20,50,0.5\n8,-1,540,450,20,-1,0.5\n";
+    for (format, text, first) in [
+        (
+            FileFormat::Coco,
+            &*coco,
+            "annotations[0].bbox: [10.0, 10.0, 0.0, 5.0] is no box",
+        ),
+        (
+            FileFormat::Mot,
+            mot,
+            "line 1: column 5 (width): and height are of no box",
+        ),
+    ] {
+        let sequence = read(format, text, Some(&camera)).unwrap();
+        assert_eq!(sequence.frames[&8].len(), 1);
+        let skipped = SkippedEntries {
+            count: 2,
+            first: first.into(),
+        };
+        assert_eq!(sequence.skipped, skipped);
+    }
+}
+
+#[test]
+fn results_have_the_categories_of_their_dataset() {
+    let folder = TempDir::new().unwrap();
+    let [truth, results] = ["truth.json", "results.json"].map(|name| folder.path().join(name));
+    let dataset = r#"{"images": [], "categories": [{"id": 1, "name": "gate"}], "annotations": []}"#;
+    fs::write(&truth, dataset).unwrap();
+    let result =
+        format!(r#"[{{"image_id": 8, "category_id": 1, "bbox": {BOX_AT_12_15}, "score": 0.5}}]"#);
+    fs::write(&results, result).unwrap();
+    let categories = FileFormat::Coco.categories(&truth).unwrap();
+    let camera = camera();
+    for (categories, label) in [(categories.as_ref(), "gate"), (None, "person")] {
+        let context = FileContext {
+            camera: Some(&camera),
+            categories,
+        };
+        let read = FileFormat::Coco.read(&results, context).unwrap();
+        assert_eq!(read[0].frames[&8][0].perceived.label, label);
+    }
+    assert_eq!(FileFormat::Coco.categories(&results).unwrap(), None);
+    let twice = dataset.replace(
+        r#"{"id": 1, "name": "gate"}"#,
+        r#"{"id": 1, "name": "gate"}, {"id": 1, "name": "door"}"#,
+    );
+    fs::write(&truth, twice).unwrap();
+    let error = FileFormat::Coco.categories(&truth).unwrap_err();
+    assert!(format!("{error:#}").contains("categories[1].id: 1 is the id of another"));
 }
