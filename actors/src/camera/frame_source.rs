@@ -15,14 +15,15 @@ use self::images::ImageSequence;
 use self::v4l2::V4l2Camera;
 use self::video::VideoProcess;
 use crate::camera::frame::CameraFrame;
+use crate::platform::secret::{HIDDEN, bare_address};
 
 /// Source of successive frames.
 pub trait FrameSource: Send {
     /// Waits for the next frame; may block as long as the camera does.
     ///
     /// # Errors
-    /// Returns a [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other
-    /// errors it must be reopened.
+    /// Returns a [`FrameError`]. After [`FrameError::Unusable`] and [`FrameError::NotDue`] the source
+    /// continues; after other errors it must be reopened.
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError>;
 }
 
@@ -45,6 +46,10 @@ pub enum FrameError {
         /// Description of the problem.
         reason: String,
     },
+    /// The next frame of a recording is due later, as in a pause of the recording; the source
+    /// continues.
+    #[error("the next frame is not due yet")]
+    NotDue,
     /// A live source delivers no more frames.
     #[error("lost {origin}: {reason}")]
     Lost {
@@ -62,6 +67,27 @@ pub enum FrameError {
         /// Its path.
         origin: String,
     },
+}
+
+/// Minimum length of a secret that is searched in other texts: a shorter one is part of many words.
+const MIN_SECRET_BYTES: usize = 4;
+
+impl FrameError {
+    /// The error without the secrets of its source.
+    fn redacted(mut self, source: &SourceConfig) -> Self {
+        if let Self::Open { reason, .. }
+        | Self::Unusable { reason, .. }
+        | Self::Lost { reason, .. } = &mut self
+        {
+            *reason = source.redacted(reason);
+        }
+        self
+    }
+
+    /// True if the source can deliver further frames without being reopened.
+    pub fn is_passing(&self) -> bool {
+        matches!(self, Self::Unusable { .. } | Self::NotDue)
+    }
 }
 
 /// Configuration of a frame source.
@@ -95,7 +121,7 @@ pub enum SourceConfig {
         /// Its `rtsp://` or `http://` address.
         url: String,
     },
-    /// A video file, played at its own rate.
+    /// A video file, played at the times of its frames and turned upright.
     Video {
         /// Path of the file.
         path: PathBuf,
@@ -105,7 +131,8 @@ pub enum SourceConfig {
     },
     /// Images in the order of their names.
     Images {
-        /// A directory, or a pattern such as `frames/%04d.png` counting up from 0 or 1.
+        /// A directory, or a pattern such as `frames/%04d.png` counting up from 0 or 1. Only the
+        /// last part of the path is a pattern, and only if no directory has its name.
         path: PathBuf,
         /// Frames per second. Default 10.
         #[serde(default = "default_fps")]
@@ -151,24 +178,46 @@ impl SourceConfig {
             | Self::Video { path, .. }
             | Self::Images { path, .. } => path.display().to_string(),
             Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
-            // Without a scheme the address is refused, but its secret must not be shown with the
-            // error.
-            Self::Url { url } if !url.contains("://") => {
-                url.rsplit('@').next().unwrap_or_default().to_owned()
-            }
-            Self::Url { url } => video::without_credentials(url),
+            Self::Url { url } => match url.split_once("://") {
+                Some((scheme, address)) => {
+                    let bare = bare_address(address).unwrap_or(HIDDEN);
+                    video::without_credentials(&format!("{scheme}://{bare}"))
+                }
+                // Without a scheme the address is refused, but its secret must not be shown with
+                // the error.
+                None => url.rsplit('@').next().unwrap_or_default().to_owned(),
+            },
         }
     }
 
-    /// Removes user and password from an address; true if there were any.
-    pub(crate) fn forget_credentials(&mut self) -> bool {
+    /// A text about this source without its secrets, such as an error of a library.
+    fn redacted(&self, text: &str) -> String {
+        let mut text = text.to_owned();
+        if let Self::Url { url } = self {
+            text = text.replace(url, &self.origin());
+            let login = url.rsplit_once('@').map_or("", |(login, _)| login);
+            let login = login.split_once("://").map_or(login, |(_, login)| login);
+            let password = login.split_once(':').map_or("", |(_, password)| password);
+            for secret in [login, password] {
+                if secret.len() >= MIN_SECRET_BYTES {
+                    text = text.replace(secret, HIDDEN);
+                }
+            }
+        }
+        video::without_credentials(&text)
+    }
+
+    /// Removes user and password from an address or a pipeline; the key if there were any.
+    pub(crate) fn forget_credentials(&mut self) -> Option<&'static str> {
         let bare = self.origin();
-        let Self::Url { url } = self else {
-            return false;
+        let (key, text) = match self {
+            Self::Url { url } => ("url", url),
+            Self::Gstreamer { pipeline } => ("pipeline", pipeline),
+            _ => return None,
         };
-        let had = bare != *url;
-        *url = bare;
-        had
+        let had = bare != *text;
+        *text = bare;
+        had.then_some(key)
     }
 
     /// Checks every value, but not whether the source exists.
@@ -190,7 +239,7 @@ impl SourceConfig {
             Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
             Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => Err(ConfigError::new(
                 "pipeline",
-                pipeline,
+                self.origin(),
                 "a pipeline that ends in appsink",
             )),
             Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(

@@ -4,7 +4,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits};
 use jpeg_encoder::{Encoder, EncodingError, ImageBuffer, JpegColorType, SamplingFactor};
 use opencv::core::{Mat, Vec3b};
 use opencv::imgproc;
@@ -23,6 +23,9 @@ pub enum ImageError {
     /// The bytes are not a whole image of a supported format.
     #[error("not an image in BMP, JPEG, PNG, PNM or WebP: {0}")]
     Malformed(#[from] image::ImageError),
+    /// A JPEG without its end, as after a crash or a broken transfer.
+    #[error("the JPEG is cut off: its end is missing")]
+    CutOff,
     /// The image is wider or higher than JPEG allows.
     #[error("{0} pixels are too many for JPEG, at most 65535 in a line")]
     TooLarge(ImageSize),
@@ -53,16 +56,20 @@ pub fn read(path: &Path) -> Result<Mat, ImageError> {
 /// upright by its EXIF data.
 ///
 /// # Errors
-/// Returns [`ImageError::Malformed`] or [`ImageError::OpenCv`].
+/// Returns [`ImageError::Malformed`], [`ImageError::CutOff`] or [`ImageError::OpenCv`].
 pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
-    let mut decoder = ImageReader::new(Cursor::new(bytes))
-        .with_guessed_format()?
-        .into_decoder()?;
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?;
+    let is_jpeg = reader.format() == Some(ImageFormat::Jpeg);
+    let mut decoder = reader.into_decoder()?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(MAX_DECODED_BYTES);
     limits.reserve(decoder.total_bytes())?;
     let orientation = decoder.orientation()?;
     let mut image = DynamicImage::from_decoder(decoder)?;
+    // The decoder fills what is missing with gray.
+    if is_jpeg && !has_end_of_image(bytes) {
+        return Err(ImageError::CutOff);
+    }
     image.apply_orientation(orientation);
     let rgb = image.into_rgb8();
     let pixels = Mat::new_rows_cols_with_bytes::<Vec3b>(
@@ -73,6 +80,33 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     let mut bgr = Mat::default();
     imgproc::cvt_color_def(&pixels, &mut bgr, imgproc::COLOR_RGB2BGR)?;
     Ok(bgr)
+}
+
+/// True if a JPEG has the marker of its end (ITU-T T.81, B.1.1.3), outside of its segments: a
+/// thumbnail inside a segment has one, too.
+fn has_end_of_image(jpeg: &[u8]) -> bool {
+    const START_OF_IMAGE: u8 = 0xD8;
+    const END_OF_IMAGE: u8 = 0xD9;
+    let mut rest = jpeg;
+    // In coded data, 0xFF precedes a zero or a restart marker, 0xD0 to 0xD7; a marker may have
+    // several 0xFF before it.
+    while let Some(at) = rest.windows(2).position(|pair| {
+        pair[0] == 0xFF && !matches!(pair[1], 0x00 | 0x01 | 0xFF | 0xD0..=START_OF_IMAGE)
+    }) {
+        if rest[at + 1] == END_OF_IMAGE {
+            return true;
+        }
+        let segment = &rest[at + 2..];
+        let length = segment
+            .first_chunk()
+            .map(|length| u16::from_be_bytes(*length));
+        let after = length.and_then(|length| segment.get(usize::from(length)..));
+        let Some(after) = after else {
+            return false;
+        };
+        rest = after;
+    }
+    false
 }
 
 /// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as

@@ -1,4 +1,4 @@
-//! Secrets in the configuration.
+//! Secrets in the configuration, and in texts that are shown.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub struct Secret(String);
 
 /// Placeholder printed instead of a secret.
-const HIDDEN: &str = "***";
+pub(crate) const HIDDEN: &str = "***";
 
 /// A placeholder that was given as the secret itself.
 #[derive(Debug, thiserror::Error)]
@@ -50,5 +50,119 @@ impl Serialize for Secret {
 impl fmt::Debug for Secret {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(HIDDEN)
+    }
+}
+
+/// A text without logins and queries of addresses in it. An address whose login has no certain end,
+/// for example because of a `/` in the password, is hidden as a whole.
+pub fn without_logins(text: &str) -> String {
+    text.split('\n')
+        .map(line_without_logins)
+        .collect::<Vec<_>>()
+        .join("\n")
+}
+
+fn line_without_logins(line: &str) -> String {
+    let mut shown = String::new();
+    let mut rest = line;
+    while let Some(at) = rest.find(SCHEME_END) {
+        let (before, address) = rest.split_at(at + SCHEME_END.len());
+        shown.push_str(before);
+        let scheme = before[..at]
+            .rfind(|c: char| !(c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.')));
+        let quote = scheme
+            .and_then(|at| before[at..].chars().next())
+            .filter(|c| matches!(c, '"' | '\'' | '`'));
+        let end = match quote {
+            Some(quote) => address.find(quote),
+            None => address.find(char::is_whitespace),
+        };
+        let address_end = match quote {
+            Some(_) => end.unwrap_or(address.len()),
+            // Punctuation of the sentence around the address.
+            None => address[..end.unwrap_or(address.len())]
+                .trim_end_matches([':', ';', ',', '.', ')', '"', '\''])
+                .len(),
+        };
+        let (address, after) = address.split_at(address_end);
+        match bare_address(address) {
+            Some(bare) => shown.push_str(bare),
+            None => shown.push_str(HIDDEN),
+        }
+        // A login may go on behind a blank or a quote.
+        let goes_on = !address.contains('@') || after.contains('@');
+        rest = if goes_on && may_be_half_a_login(address) {
+            ""
+        } else {
+            after
+        };
+    }
+    shown + rest
+}
+
+const SCHEME_END: &str = "://";
+
+/// An address, after its scheme, without login and query; `None` if it is not certain where the
+/// login ends.
+pub(crate) fn bare_address(address: &str) -> Option<&str> {
+    let is_end = |c: char| matches!(c, '/' | '?' | '#' | '"' | '\'' | '\\') || c.is_whitespace();
+    let authority = &address[..address.find(is_end).unwrap_or(address.len())];
+    let login = authority.rfind('@').map_or(0, |at| at + 1);
+    let bare = &address[login..];
+    if bare.contains('@') || may_be_half_a_login(bare) {
+        return None;
+    }
+    Some(&bare[..bare.find('?').unwrap_or(bare.len())])
+}
+
+/// True if an address without `@` begins with `name:`, but not with a port behind it.
+fn may_be_half_a_login(address: &str) -> bool {
+    let is_end = |c: char| matches!(c, '/' | '?' | '#') || c.is_whitespace();
+    let authority = &address[..address.find(is_end).unwrap_or(address.len())];
+    if authority.contains('@') || authority.starts_with('[') {
+        return false;
+    }
+    let port = authority.split_once(':').map(|(_, port)| port);
+    port.is_some_and(|port| !port.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn logins_of_addresses_are_not_shown_and_uncertain_ones_hide_all() {
+        for (text, shown) in [
+            ("rtsp://user:p@ss@camera:554/1", "rtsp://camera:554/1"),
+            (
+                "cannot open rtsp://127.0.0.1:1: refused",
+                "cannot open rtsp://127.0.0.1:1: refused",
+            ),
+            (
+                "at http://camera/video?user=admin&pwd=hush.",
+                "at http://camera/video.",
+            ),
+            (
+                "to http://[fe80::1]:80/x, 2 tries",
+                "to http://[fe80::1]:80/x, 2 tries",
+            ),
+            ("rtsp://admin:Geh/eim1@camera/1 failed", "rtsp://*** failed"),
+            ("rtsp://admin:Geh?eim1@camera/1", "rtsp://***"),
+            ("rtsp://admin:G@h/eim1@camera/1", "rtsp://***"),
+            ("http://camera/a@b", "http://***"),
+            ("rtsp://admin:ge heim1@camera/1 failed", "rtsp://***"),
+            (
+                "location=\"rtsp://admin:ge heim1@camera\" ! x",
+                "location=\"rtsp://***\" ! x",
+            ),
+            ("'rtsp://admin:ge'heim1@camera'", "'rtsp://***"),
+            ("rtsp://admin:ge\"heim1@camera/1", "rtsp://***"),
+            (
+                "first\nmqtt://u:geheim1@broker:1883\nlast",
+                "first\nmqtt://broker:1883\nlast",
+            ),
+        ] {
+            assert_eq!(without_logins(text), shown);
+        }
     }
 }

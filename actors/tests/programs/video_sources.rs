@@ -88,6 +88,143 @@ fn a_video_file_plays_once_or_again_and_again() {
     assert!(near(&seen, &[40, 120, 200, 40, 120]), "{seen:?}");
 }
 
+/// An MP4 of four frames, black with a white upper left quarter, 0.1 s apart.
+fn write_flag(path: &Path) {
+    let mut flag = gray(0);
+    for (row, column) in (0..24).flat_map(|row| (0..32).map(move |column| (row, column))) {
+        *flag.at_2d_mut::<Vec3b>(row, column).unwrap() = [255; 3].into();
+    }
+    let mp4v = VideoWriter::fourcc('m', 'p', '4', 'v').unwrap();
+    let mut writer = VideoWriter::new(path, mp4v, 10.0, Size::new(64, 48), true).unwrap();
+    assert!(writer.is_opened().unwrap());
+    for _ in 0..4 {
+        writer.write(&flag).unwrap();
+    }
+    writer.release().unwrap();
+}
+
+fn place_of(mp4: &[u8], name: &[u8; 4]) -> usize {
+    let place = mp4.windows(4).rposition(|found| found == name);
+    place.expect("a box of this name") - 4
+}
+
+/// Sets the matrix by which players show the track (ISO 14496-12, 8.3.2).
+fn set_matrix(mp4: &mut [u8], [a, b, c, d]: [i32; 4]) {
+    let matrix = [a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30];
+    let at = place_of(mp4, b"tkhd") + 48;
+    let bytes: Vec<u8> = matrix.into_iter().flat_map(i32::to_be_bytes).collect();
+    mp4[at..at + bytes.len()].copy_from_slice(&bytes);
+}
+
+/// Sets the durations of frames, in those of the file's equal ones. The table is at the end of the
+/// file, so that nothing else moves.
+fn set_durations(mp4: &mut Vec<u8>, durations: &[u32]) {
+    let table = place_of(mp4, b"stts");
+    let old = mp4[table..table + 24].to_vec();
+    assert_eq!(old[..16], *b"\0\0\0\x18stts\0\0\0\0\0\0\0\x01");
+    let usual = u32::from_be_bytes(old[20..].try_into().unwrap());
+    let grown_by = 8 * (durations.len() as u32 - 1);
+    for name in [b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"] {
+        let at = place_of(mp4, name);
+        let length = u32::from_be_bytes(mp4[at..at + 4].try_into().unwrap());
+        mp4[at..at + 4].copy_from_slice(&(length + grown_by).to_be_bytes());
+    }
+    let rows = durations
+        .iter()
+        .flat_map(|duration| [1, duration * usual])
+        .flat_map(u32::to_be_bytes);
+    let rows: Vec<u8> = (durations.len() as u32)
+        .to_be_bytes()
+        .into_iter()
+        .chain(rows)
+        .collect();
+    mp4.splice(table + 12..table + 24, rows);
+}
+
+#[test]
+fn a_video_is_shown_as_players_show_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("flag.mp4");
+    write_flag(&path);
+    let written = fs::read(&path).unwrap();
+    // Matrix, width and height, and column and row of the white quarter's middle.
+    for (matrix, size, white) in [
+        ([1, 0, 0, 1], (64, 48), (16, 12)),
+        ([0, 1, -1, 0], (48, 64), (36, 16)),
+        ([-1, 0, 0, -1], (64, 48), (48, 36)),
+        ([0, -1, 1, 0], (48, 64), (12, 48)),
+        ([2, 0, 0, 1], (128, 48), (32, 12)),
+    ] {
+        let mut mp4 = written.clone();
+        set_matrix(&mut mp4, matrix);
+        fs::write(&path, &mp4).unwrap();
+        let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = true")).unwrap();
+        for _ in 0..5 {
+            let image = source.next_frame().unwrap().image;
+            assert_eq!((image.cols(), image.rows()), size, "{matrix:?}");
+            let (column, row) = white;
+            let brightness = |row, column| image.at_2d::<Vec3b>(row, column).unwrap()[1];
+            let opposite = brightness(size.1 - 1 - row, size.0 - 1 - column);
+            assert!(
+                brightness(row, column) > 200 && opposite < 50,
+                "{matrix:?}: {} {opposite}",
+                brightness(row, column)
+            );
+        }
+    }
+}
+
+#[test]
+fn frames_come_at_the_times_in_the_file_and_a_pause_is_no_stall() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("flag.mp4");
+    write_flag(&path);
+    let mut mp4 = fs::read(&path).unwrap();
+    // The list of edits would end the film at its former duration.
+    let edits = place_of(&mp4, b"edts");
+    mp4[edits + 4..edits + 8].copy_from_slice(b"free");
+    set_durations(&mut mp4, &[1, 2, 15, 1]);
+    fs::write(&path, &mp4).unwrap();
+    let mut source = source(&format!("kind = 'video'\npath = {path:?}"))
+        .open(Duration::from_millis(300))
+        .unwrap();
+    let (mut times, mut pauses) = (Vec::new(), 0);
+    loop {
+        match source.next_frame() {
+            Ok(frame) => times.push(frame.captured_at),
+            Err(FrameError::NotDue) => pauses += 1,
+            Err(FrameError::Ended { .. }) => break,
+            Err(error) => panic!("{error}"),
+        }
+    }
+    let steps: Vec<f64> = times
+        .windows(2)
+        .map(|pair| pair[1].since(pair[0]).as_secs_f64())
+        .collect();
+    assert_eq!(steps.len(), 3, "{steps:?}");
+    for (step, expected) in steps.iter().zip([0.1, 0.2, 1.5]) {
+        assert!((step - expected).abs() < 0.08, "{steps:?}");
+    }
+    assert!(
+        pauses > 5,
+        "{pauses} signs of life in 1.5 s, each within 0.15 s"
+    );
+}
+
+#[test]
+fn a_name_of_a_video_means_nothing_to_a_library() {
+    let directory = tempfile::tempdir().unwrap();
+    for name in ["50%_a:b-%04d.avi", "-i clip.avi", "http:clip.avi"] {
+        let path = directory.path().join(name);
+        let plain = directory.path().join("plain.avi");
+        write_clip(&plain, 200.0);
+        fs::rename(&plain, &path).unwrap();
+        let mut source = open(&format!("kind = 'video'\npath = {path:?}")).unwrap();
+        let (seen, _) = play(source.as_mut());
+        assert!(near(&seen, &CLIP), "{name}: {seen:?}");
+    }
+}
+
 #[test]
 fn frames_are_dated_by_the_clock_of_the_node() {
     let directory = tempfile::tempdir().unwrap();

@@ -328,6 +328,9 @@ impl CaptureLoop {
                     );
                 }
                 Ok(CaptureEvent::Read(from, _)) if from != opening => {}
+                Ok(CaptureEvent::Read(_, Err(FrameError::NotDue))) => {
+                    deadline = Instant::now() + stall_timeout;
+                }
                 Ok(CaptureEvent::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
                     if last_unusable.is_none() {
                         tracing::warn!(%error, "frame skipped; others until the next whole one are only counted");
@@ -385,9 +388,7 @@ impl Reader {
         };
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
-            let failed = read
-                .as_ref()
-                .is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
+            let failed = read.as_ref().is_err_and(|error| !error.is_passing());
             self.send(read);
             if failed {
                 return;

@@ -9,6 +9,9 @@ use crate::platform::clock;
 
 const EXTENSIONS: [&str; 7] = ["bmp", "jpeg", "jpg", "pgm", "png", "ppm", "webp"];
 
+/// Maximum number of digits in the names of a pattern: those of the largest number.
+const MAX_DIGITS: usize = 20;
+
 /// Images in the order of their names.
 pub(super) struct ImageSequence {
     origin: String,
@@ -27,8 +30,10 @@ impl ImageSequence {
             origin: origin.clone(),
             reason,
         };
-        let files = if origin.contains('%') {
-            numbered(&origin).ok_or_else(|| failed("need one %d or %0Nd in the pattern".into()))?
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let files = if name.contains('%') && !path.is_dir() {
+            numbered(path, &name)
+                .ok_or_else(|| failed("need one %d or %0Nd in the pattern".into()))?
         } else {
             in_directory(path).map_err(|e| failed(e.to_string()))?
         };
@@ -86,16 +91,20 @@ pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// Existing files of a pattern like `before%04dafter`, counting up to the first gap.
-fn numbered(pattern: &str) -> Option<Vec<PathBuf>> {
-    let (before, rest) = pattern.split_once('%')?;
-    let (digits, after) = rest.split_once('d')?;
-    let width: usize = if digits.is_empty() {
-        0
-    } else {
-        digits.parse().ok()?
-    };
-    let file = |number: u64| PathBuf::from(format!("{before}{number:0width$}{after}"));
+/// Existing files of the pattern `name`, the last part of `path`, counting up to the first gap.
+/// `None` unless the name has one place for the number.
+fn numbered(path: &Path, name: &str) -> Option<Vec<PathBuf>> {
+    let mut places = name.match_indices('%').filter_map(|(at, _)| {
+        let (digits, after) = name[at + 1..].split_once('d')?;
+        let width: usize = if digits.is_empty() {
+            0
+        } else {
+            digits.parse().ok()?
+        };
+        (width <= MAX_DIGITS).then_some((&name[..at], width, after))
+    });
+    let (before, width, after) = places.next().filter(|_| places.next().is_none())?;
+    let file = |number: u64| path.with_file_name(format!("{before}{number:0width$}{after}"));
     let first = if file(0).is_file() { 0 } else { 1 };
     Some(
         (first..)

@@ -72,6 +72,29 @@ fn images_come_in_order_from_a_directory_and_from_a_pattern() {
 }
 
 #[test]
+fn a_percent_sign_in_a_name_is_a_pattern_only_where_a_number_can_stand() {
+    let parent = tempfile::tempdir().unwrap();
+    for (folder, pattern) in [
+        ("run_50%", ""),
+        ("day%03d", ""),
+        ("a:b 100%d", "f%03d.png"),
+        ("-", "f%03d.png"),
+    ] {
+        let directory = parent.path().join(folder);
+        std::fs::create_dir(&directory).unwrap();
+        write_images(&directory);
+        let path = directory.join(pattern);
+        let mut source = open(&format!("kind = 'images'\npath = {path:?}\nfps = 500.0")).unwrap();
+        assert_eq!(play(source.as_mut()).0, [50, 100, 150], "{path:?}");
+    }
+    let marked = parent.path().join("50%_f000.png");
+    std::fs::copy(parent.path().join("-/f000.png"), marked).unwrap();
+    let path = parent.path().join("50%_f%03d.png");
+    let mut source = open(&format!("kind = 'images'\npath = {path:?}\nfps = 500.0")).unwrap();
+    assert_eq!(play(source.as_mut()).0, [50]);
+}
+
+#[test]
 fn a_bad_image_is_passed_over_and_the_rest_is_played() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
@@ -167,4 +190,46 @@ fn bad_configuration_is_refused() {
     assert_eq!(camera.validate().expect_err("no width").key, "width");
     let images: SourceConfig = toml::from_str("kind = 'images'\npath = 'a'\nfps = 0.0").unwrap();
     assert_eq!(images.validate().expect_err("no rate").key, "fps");
+}
+
+#[test]
+fn no_part_of_a_password_is_in_any_text_about_a_source() {
+    for password in [
+        "Geh/eim1",
+        "Geh eim1",
+        "Geh\"eim1",
+        "Geh'eim1",
+        "G@h/eim1",
+        "Geh?eim1",
+        "Geh#eim1",
+        "eim1",
+    ] {
+        let url = format!("rtsp://admin:{password}@127.0.0.1:1/stream1");
+        let mut source = SourceConfig::Url { url: url.clone() };
+        let said = [
+            source.origin(),
+            source.redacted(&format!("cannot open {url}: refused")),
+            source.redacted(&format!("[tcp] admin:{password}@127.0.0.1 is refused")),
+            source.redacted(&format!("wrong password \"{password}\"")),
+            source
+                .validate()
+                .err()
+                .map(|error| error.to_string())
+                .unwrap_or_default(),
+        ];
+        for text in said {
+            assert!(!text.contains("eim1") && !text.contains("Geh"), "{text}");
+        }
+        assert_eq!(source.forget_credentials(), Some("url"));
+        assert!(!format!("{source:?}").contains("eim1"), "{source:?}");
+
+        let quote = if password.contains('"') { '\'' } else { '"' };
+        let mut pipeline = SourceConfig::Gstreamer {
+            pipeline: format!("rtspsrc location={quote}{url}{quote} ! fakesink"),
+        };
+        let error = pipeline.validate().expect_err("no appsink").to_string();
+        assert!(!error.contains("eim1") && !error.contains("Geh"), "{error}");
+        assert_eq!(pipeline.forget_credentials(), Some("pipeline"));
+        assert!(!format!("{pipeline:?}").contains("eim1"), "{pipeline:?}");
+    }
 }

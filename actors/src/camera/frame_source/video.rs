@@ -30,6 +30,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
 use super::{FrameError, FrameSource, SourceConfig};
 use crate::camera::frame::CameraFrame;
+use crate::platform::secret::without_logins;
 use crate::platform::{clock, installed};
 
 /// Name of the program.
@@ -51,6 +52,7 @@ const LAST_WORDS_TIME: Duration = Duration::from_millis(200);
 /// A running `ecod-video` and the frames that it writes.
 pub(super) struct VideoProcess {
     origin: String,
+    source: SourceConfig,
     child: ProgramGuard,
     output: BufReader<DeadlineReader>,
     last_words: LastWords,
@@ -96,7 +98,7 @@ impl VideoProcess {
                 timeout,
             },
         );
-        let last_words = LastWords::collect(&origin, stderr).map_err(|e| failed(e.to_string()))?;
+        let last_words = LastWords::collect(source, stderr).map_err(|e| failed(e.to_string()))?;
         let frame_time = 2 * timeout;
         let output = BufReader::new(DeadlineReader {
             stdout,
@@ -104,6 +106,7 @@ impl VideoProcess {
         });
         let mut process = Self {
             origin,
+            source: source.clone(),
             child,
             output,
             last_words,
@@ -112,7 +115,7 @@ impl VideoProcess {
         };
         match process.receive(MIN_OPEN_TIME.max(frame_time)) {
             Ok(VideoMessage::Opened) => Ok(process),
-            Ok(VideoMessage::Failed(error)) => Err(error),
+            Ok(VideoMessage::Failed(error)) => Err(error.redacted(source)),
             Ok(VideoMessage::Frame(_)) => Err(failed(format!("{PROGRAM} is of another version"))),
             Err(FrameError::Lost { reason, .. }) => Err(failed(reason)),
             Err(error) => Err(failed(error.to_string())),
@@ -195,7 +198,7 @@ impl FrameSource for VideoProcess {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         match self.receive(self.frame_time)? {
             VideoMessage::Frame(header) => self.receive_pixels(&header),
-            VideoMessage::Failed(error) => Err(error),
+            VideoMessage::Failed(error) => Err(error.redacted(&self.source)),
             VideoMessage::Opened => Err(self.lost(format!("{PROGRAM} is of another version"))),
         }
     }
@@ -236,12 +239,12 @@ struct LastWords {
 }
 
 impl LastWords {
-    fn collect(origin: &str, stderr: ChildStderr) -> io::Result<Self> {
+    fn collect(source: &SourceConfig, stderr: ChildStderr) -> io::Result<Self> {
         let (line, (until, ended)) = (Arc::<Mutex<String>>::default(), mpsc::channel());
-        let (camera, last) = (origin.to_owned(), Arc::clone(&line));
+        let (source, last) = (source.clone(), Arc::clone(&line));
         thread::Builder::new()
             .name("video-log".into())
-            .spawn(move || log(&camera, stderr, &last, &until))?;
+            .spawn(move || log(&source, stderr, &last, &until))?;
         Ok(Self { line, ended })
     }
 
@@ -256,9 +259,10 @@ impl LastWords {
     }
 }
 
-fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<()>) {
+fn log(source: &SourceConfig, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<()>) {
+    let camera = source.origin();
     for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
-        let line = without_credentials(String::from_utf8_lossy(&line).trim_end());
+        let line = source.redacted(String::from_utf8_lossy(&line).trim_end());
         tracing::debug!(camera, "{line}");
         if let Ok(mut last) = last.lock() {
             *last = line;
@@ -269,21 +273,14 @@ fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<
 /// A text that may be logged: addresses without login and query, and without values of properties
 /// such as `user-pw`.
 pub(super) fn without_credentials(text: &str) -> String {
-    #[expect(clippy::expect_used, reason = "the expressions are constants")]
-    static SECRETS: LazyLock<[(Regex, &str); 3]> = LazyLock::new(|| {
-        let login = r#"://[^/"'\s]*@"#;
-        let query = r#"(://[^?"'\s]*)\?[^"'\s]*"#;
+    #[expect(clippy::expect_used, reason = "the expression is constant")]
+    static PROPERTY: LazyLock<Regex> = LazyLock::new(|| {
         let value = r#"(?:\([^)]*\))?(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|(?:\\.|[^\s"'])+)"#;
         let property =
             format!(r"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*){value}");
-        [(login, "://"), (query, "$1"), (&property, "${1}…")]
-            .map(|(secret, bare)| (Regex::new(secret).expect("a valid expression"), bare))
+        Regex::new(&property).expect("a valid expression")
     });
-    SECRETS
-        .iter()
-        .fold(text.to_owned(), |text, (secret, bare)| {
-            secret.replace_all(&text, *bare).into_owned()
-        })
+    without_logins(&PROPERTY.replace_all(text, "${1}…"))
 }
 
 #[cfg(test)]
@@ -298,11 +295,11 @@ mod tests {
         );
         assert_eq!(
             without_credentials("rtsp://user:p?ss@camera/1"),
-            "rtsp://camera/1"
+            "rtsp://***"
         );
         assert_eq!(
-            without_credentials("http://camera/a@b"),
-            "http://camera/a@b"
+            without_credentials("rtsp://camera/user=admin_password=hush_channel=1"),
+            "rtsp://camera/user=admin_password=…"
         );
         assert_eq!(
             without_credentials("http://camera/video?user=admin&pwd=hush"),

@@ -167,3 +167,31 @@ fn a_header_that_states_more_than_a_machine_has_is_an_error() {
         "{error:?}"
     );
 }
+
+#[test]
+fn a_jpeg_without_its_end_is_refused_as_every_other_cut_image_is() {
+    let whole = encode_jpeg(&flag(), 95).unwrap();
+    let thumbnail = [
+        &[0xff, 0xe1],
+        (whole.len() as u16 + 2).to_be_bytes().as_slice(),
+        &whole,
+    ]
+    .concat();
+    let pictured = [&whole[..2], &thumbnail, &whole[2..]].concat();
+    // Telephones append a film to a photograph.
+    let extended = [&whole[..], &[0; 100]].concat();
+    for file in [&whole, &pictured, &extended] {
+        decode(file).unwrap();
+    }
+    let cut = |bytes: usize| decode(&pictured[..pictured.len() - bytes]);
+    for bytes in [1, 2, 20] {
+        let error = cut(bytes).expect_err("cut off");
+        assert!(matches!(error, ImageError::CutOff), "{bytes}: {error}");
+    }
+    assert!(cut(whole.len() / 2).is_err());
+    let zeros = [&whole[..whole.len() / 2], &vec![0; whole.len() / 2]].concat();
+    assert!(
+        decode(&zeros).is_err(),
+        "as a crash of a file system leaves it"
+    );
+}

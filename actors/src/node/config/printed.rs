@@ -54,13 +54,13 @@ impl NodeConfig {
         }
         #[cfg(feature = "camera")]
         for camera in shown.camera.iter_mut().chain(&mut shown.cameras) {
-            if camera.source.forget_credentials() {
+            if let Some(key) = camera.source.forget_credentials() {
                 let of = camera
                     .name
                     .as_ref()
                     .map_or_else(String::new, |name| format!(" of camera {name}"));
                 let line = format!(
-                    "# user and password of `camera.source.url`{of} are set but not shown: add them\n"
+                    "# user and password of `camera.source.{key}`{of} are set but not shown: add them\n"
                 );
                 comment.push_str(&line);
             }

@@ -4,20 +4,21 @@
 use std::fs::File;
 use std::io::{self, BufRead, Write};
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use opencv::core::{Mat, Vector};
+use opencv::core::{self, Mat, Size, Vector};
+use opencv::imgproc;
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 use rustix::process::{Signal, getpid, kill_process};
 
 use super::protocol::{self, ImageHeader, VideoMessage, VideoRequest};
 use crate::camera::frame::CameraFrame;
-use crate::camera::frame_source::{FrameError, FramePacer, FrameSource, SourceConfig};
+use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig};
 use crate::platform::clock;
 
 /// Maximum number of bytes in a pipe, as far as the kernel allows: with fewer bytes, both sides
@@ -55,6 +56,9 @@ fn serve() -> anyhow::Result<()> {
     loop {
         match video.next_frame() {
             Ok(frame) => write_frame(&mut output, &frame)?,
+            Err(error) if error.is_passing() => {
+                protocol::write_line(&mut output, &VideoMessage::Failed(error))?;
+            }
             Err(error) => {
                 return Ok(protocol::write_line(
                     &mut output,
@@ -102,18 +106,118 @@ const PLAUSIBLE_FPS: RangeInclusive<f64> = 0.01..=1000.0;
 /// Rate of a video file without a plausible one.
 const FALLBACK_FPS: f64 = 25.0;
 
+/// Maximum time without a message while the next frame of a file is not due.
+const MAX_SILENCE: Duration = Duration::from_secs(1);
+
 /// An open capture.
 struct Video {
     origin: String,
     capture: VideoCapture,
+    presentation: Presentation,
     playback: Option<Playback>,
     seq: u64,
 }
 
 /// Playback of a file.
 struct Playback {
-    pace: FramePacer,
+    path: PathBuf,
+    pacer: StampPacer,
     looping: bool,
+    /// The next frame, until it is due.
+    next: Option<Mat>,
+    /// Time between two messages while the next frame is not due.
+    patience: Duration,
+}
+
+/// Delays the frames of a file to the times that the file states.
+struct StampPacer {
+    /// Time between two frames without usable stamps.
+    period: Duration,
+    /// The latest frame's stamp.
+    stamp_ms: f64,
+    due: Option<Instant>,
+}
+
+impl StampPacer {
+    /// Schedules the frame with this stamp. Without a later stamp than the frame before, as after
+    /// a restart, the frame is one period later.
+    fn schedule(&mut self, stamp_ms: f64) {
+        let step_ms = stamp_ms - self.stamp_ms;
+        let step = Duration::try_from_secs_f64(step_ms / 1e3).unwrap_or_default();
+        let step = if step.is_zero() { self.period } else { step };
+        self.stamp_ms = stamp_ms;
+        let now = Instant::now();
+        self.due = Some(self.due.map_or(now, |due| (due + step).max(now)));
+    }
+
+    /// Sleeps until the scheduled frame is due, but not longer than `most`; true if it is due.
+    fn wait(&self, most: Duration) -> bool {
+        let remaining = self
+            .due
+            .map(|due| due.saturating_duration_since(Instant::now()))
+            .unwrap_or_default();
+        thread::sleep(remaining.min(most));
+        remaining <= most
+    }
+}
+
+/// How a player shows the decoded frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Presentation {
+    /// OpenCV's code of the rotation.
+    rotation: Option<i32>,
+    /// Width of a pixel divided by its height.
+    pixel_aspect: f64,
+}
+
+/// Plausible ratios of a pixel's width to its height; the largest of anamorphic formats is 2.
+const PIXEL_ASPECTS: RangeInclusive<f64> = 0.2..=5.0;
+
+impl Presentation {
+    /// Reads the presentation that a source states, and switches off OpenCV's own rotation.
+    fn of(capture: &mut VideoCapture) -> opencv::Result<Self> {
+        let mut rotation_deg = 0.0;
+        if capture.set(videoio::CAP_PROP_ORIENTATION_AUTO, 0.0)? {
+            rotation_deg = capture.get(videoio::CAP_PROP_ORIENTATION_META)?;
+        }
+        // OpenCV 4.6 states, and would apply, the opposite angle: opencv/opencv#22088.
+        if (core::get_version_major(), core::get_version_minor()) == (4, 6) {
+            rotation_deg = -rotation_deg;
+        }
+        let ratio =
+            capture.get(videoio::CAP_PROP_SAR_NUM)? / capture.get(videoio::CAP_PROP_SAR_DEN)?;
+        let is_plausible = PIXEL_ASPECTS.contains(&ratio);
+        Ok(Self {
+            rotation: match rotation_deg.rem_euclid(360.0).round() as i32 {
+                90 => Some(core::ROTATE_90_CLOCKWISE),
+                180 => Some(core::ROTATE_180),
+                270 => Some(core::ROTATE_90_COUNTERCLOCKWISE),
+                _ => None,
+            },
+            pixel_aspect: if is_plausible { ratio } else { 1.0 },
+        })
+    }
+
+    /// The image with square pixels and upright.
+    fn apply(self, mut image: Mat) -> opencv::Result<Mat> {
+        let (width, height) = (f64::from(image.cols()), f64::from(image.rows()));
+        // The shorter side of the pixels is enlarged, so that no detail is lost.
+        let size = Size::new(
+            (width * self.pixel_aspect.max(1.0)).round() as i32,
+            (height / self.pixel_aspect.min(1.0)).round() as i32,
+        );
+        if size != image.size()? {
+            let mut square = Mat::default();
+            imgproc::resize(&image, &mut square, size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
+            image = square;
+        }
+        if let Some(code) = self.rotation {
+            let mut upright = Mat::default();
+            core::rotate(&image, &mut upright, code)?;
+            image = upright;
+        }
+        Ok(image)
+    }
 }
 
 impl Video {
@@ -122,7 +226,7 @@ impl Video {
         match source {
             SourceConfig::Gstreamer { pipeline } => Self::pipeline(pipeline, origin),
             SourceConfig::Url { url } => Self::url(url, origin, timeout),
-            SourceConfig::Video { path, looping } => Self::file(path, origin, *looping),
+            SourceConfig::Video { path, looping } => Self::file(path, origin, *looping, timeout),
             SourceConfig::V4l2 { .. } | SourceConfig::Images { .. } => Err(FrameError::Open {
                 origin,
                 reason: "the node reads it itself".into(),
@@ -174,17 +278,31 @@ impl Video {
         })
     }
 
-    fn file(path: &Path, origin: String, looping: bool) -> Result<Self, FrameError> {
+    fn file(
+        path: &Path,
+        origin: String,
+        looping: bool,
+        timeout: Duration,
+    ) -> Result<Self, FrameError> {
         readable(path, &origin)?;
-        let mut video = Self::live(origin, || VideoCapture::from_file(path, videoio::CAP_ANY))?;
+        // In a relative path, FFmpeg takes `-` for a pipe and the text before `:` for a protocol.
+        let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+        let mut video = Self::live(origin, || VideoCapture::from_file(&path, videoio::CAP_ANY))?;
         let fps = video
             .capture
             .get(videoio::CAP_PROP_FPS)
             .ok()
             .filter(|fps| PLAUSIBLE_FPS.contains(fps));
         video.playback = Some(Playback {
-            pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)),
+            path,
+            pacer: StampPacer {
+                period: Duration::from_secs_f64(1.0 / fps.unwrap_or(FALLBACK_FPS)),
+                stamp_ms: 0.0,
+                due: None,
+            },
             looping,
+            next: None,
+            patience: MAX_SILENCE.min(timeout / 2),
         });
         Ok(video)
     }
@@ -197,15 +315,17 @@ impl Video {
             origin: origin.clone(),
             reason,
         };
-        let capture = open().map_err(|e| failed(e.message))?;
+        let mut capture = open().map_err(|e| failed(e.message))?;
         if !capture.is_opened().map_err(|e| failed(e.message))? {
             return Err(failed(
                 "opencv finds no video there: see whether a player shows it".into(),
             ));
         }
+        let presentation = Presentation::of(&mut capture).map_err(|e| failed(e.message))?;
         Ok(Self {
             origin,
             capture,
+            presentation,
             playback: None,
             seq: 0,
         })
@@ -214,29 +334,46 @@ impl Video {
     /// The next image, if there is one.
     fn read(&mut self) -> Result<Option<Mat>, FrameError> {
         let mut image = Mat::default();
-        let read = self.capture.read(&mut image);
-        let read = read.map_err(|e| FrameError::Lost {
+        let read = self.capture.read(&mut image).map_err(|e| self.lost(e))?;
+        if !read || image.empty() {
+            return Ok(None);
+        }
+        let image = self.presentation.apply(image);
+        image.map(Some).map_err(|e| self.lost(e))
+    }
+
+    /// The next image of a file, from its beginning again if it loops.
+    fn read_file(&mut self) -> Result<Option<Mat>, FrameError> {
+        let image = self.read()?;
+        let again = self
+            .playback
+            .as_ref()
+            .filter(|playback| image.is_none() && playback.looping && self.seq > 0);
+        let Some(playback) = again else {
+            return Ok(image);
+        };
+        let reopened = VideoCapture::from_file(&playback.path, videoio::CAP_ANY);
+        self.capture = reopened.map_err(|e| self.lost(e))?;
+        self.presentation = Presentation::of(&mut self.capture).map_err(|e| self.lost(e))?;
+        self.read()
+    }
+
+    fn lost(&self, error: opencv::Error) -> FrameError {
+        FrameError::Lost {
             origin: self.origin.clone(),
-            reason: e.message,
-        })?;
-        Ok((read && !image.empty()).then_some(image))
+            reason: error.message,
+        }
     }
 }
 
 impl FrameSource for Video {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
-        if let Some(playback) = &mut self.playback {
-            playback.pace.wait();
-        }
-        let mut image = self.read()?;
-        if image.is_none() && self.playback.as_ref().is_some_and(|p| p.looping) && self.seq > 0 {
-            let reopened = VideoCapture::from_file(&self.origin, videoio::CAP_ANY);
-            self.capture = reopened.map_err(|e| FrameError::Lost {
-                origin: self.origin.clone(),
-                reason: e.message,
-            })?;
-            image = self.read()?;
-        }
+        let waiting = self.playback.as_mut().and_then(|p| p.next.take());
+        let is_waiting = waiting.is_some();
+        let image = match waiting {
+            Some(image) => Some(image),
+            None => self.read_file()?,
+        };
         let origin = || self.origin.clone();
         let image = image.ok_or_else(|| match self.playback {
             Some(_) => FrameError::Ended { origin: origin() },
@@ -245,6 +382,16 @@ impl FrameSource for Video {
                 reason: "no further frame".into(),
             },
         })?;
+        if let Some(playback) = &mut self.playback {
+            if !is_waiting {
+                let stamp_ms = self.capture.get(videoio::CAP_PROP_POS_MSEC);
+                playback.pacer.schedule(stamp_ms.unwrap_or_default());
+            }
+            if !playback.pacer.wait(playback.patience) {
+                playback.next = Some(image);
+                return Err(FrameError::NotDue);
+            }
+        }
         let frame = CameraFrame {
             image,
             captured_at: clock::now(),

@@ -24,7 +24,7 @@ pub(super) enum VideoMessage {
     Opened,
     /// A frame, whose pixels follow row by row.
     Frame(ImageHeader),
-    /// The last line, except after [`FrameError::Unusable`].
+    /// The last line, unless [`FrameError::is_passing`].
     Failed(FrameError),
 }
 
