@@ -21,7 +21,7 @@ use super::{Failure, print};
 #[cfg(feature = "camera")]
 use crate::camera::frame_source::capture::Readers;
 use crate::node::NodeError;
-use crate::node::config::NodeConfig;
+use crate::node::config::{NodeConfig, variables_without_key};
 use crate::node::roaming::Roamer;
 use crate::node::service::ServiceManager;
 #[cfg(feature = "camera")]
@@ -214,6 +214,13 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
         tracing::warn!(
             "no [camera] is configured: of this vehicle, only programs beside it report"
+        );
+    }
+    let variables = variables_without_key();
+    if !variables.is_empty() {
+        tracing::warn!(
+            variables = variables.join(", "),
+            "environment variables that begin with ECOD_ but name no key are left out"
         );
     }
     let mut vehicle = Roamer::start(config).await?;

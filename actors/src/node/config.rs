@@ -27,6 +27,7 @@ use figment::providers::{Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
 pub use self::cells::CellEntry;
+pub(crate) use self::extraction::variables_without_key;
 use self::extraction::{environment, extract};
 pub use self::shared::{DescriptionError, SharedConfig, StatedKeys};
 use crate::actors::reputation_keeper::ReputationKeeperConfig;

@@ -53,6 +53,46 @@ fn environment_values_that_look_like_numbers_are_text_where_text_is_wanted() {
 }
 
 #[test]
+fn variables_of_a_container_platform_do_not_stop_a_node() {
+    let output = printed(&[
+        ("ECOD_SERVICE_HOST", "10.0.0.9"),
+        ("ECOD_SERVICE_PORT", "1883"),
+        ("ECOD_SERVICE_PORT_MQTT", "1883"),
+        ("ECOD_PORT", "tcp://10.0.0.9:1883"),
+        ("ECOD_PORT_1883_TCP_PROTO", "tcp"),
+        ("ECOD__CAMERA_SERVICE_HOST", "10.0.0.10"),
+        ("ECOD_CELL", "lot-7"),
+    ]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(
+        text.contains("cell = \"lot-7\"") && !text.contains("10.0.0"),
+        "{text}"
+    );
+    let output = printed(&[("ECOD_MQTT__KEEPALIVE", "7")]);
+    assert!(
+        stderr(&output).contains("`mqtt.keepalive`"),
+        "{}",
+        stderr(&output)
+    );
+}
+
+#[test]
+fn a_source_given_as_text_is_refused_without_its_password() {
+    for source in [
+        "rtsp://admin:Geh/eim1@camera/1",
+        "rtsp://admin:Geh eim1@camera/1",
+    ] {
+        let output = printed(&[("ECOD_CAMERA__SOURCE", source)]);
+        let error = stderr(&output);
+        assert!(
+            error.contains("`camera.source`") && !error.contains("eim1") && !error.contains("Geh"),
+            "{error}"
+        );
+    }
+}
+
+#[test]
 fn errors_in_the_environment_name_the_variable_and_show_no_password() {
     let output = printed(&[
         ("ECOD_MQTT__KEEP_ALIVE_S", "soon"),

@@ -1,19 +1,49 @@
 //! Converts the values read from all sources to a configuration, or to an error message.
 
+use std::sync::LazyLock;
+
 use figment::Figment;
+use figment::error::Kind;
 use figment::providers::{Env, Serialized};
 use figment::value::{Dict, Value};
 
 use super::{LoadError, NodeConfig};
+use crate::platform::secret::without_logins;
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
 
-/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the
-/// address of a node, not the table of the same name.
+/// `ECOD_…`, two underscores between the levels of a key. Variables of other programs are left out:
+/// `ECOD_BROKER` is the clients', the address of a node and not the table of the same name, and
+/// container platforms set `ECOD_PORT` and others for a service named `ecod`.
 pub(super) fn environment() -> Env {
     Env::prefixed(ENVIRONMENT_PREFIX)
         .ignore(&["broker"])
+        .filter(|name| is_of_a_key(name.as_str()))
         .split("__")
+}
+
+/// Variables that begin like a key's, but belong to none.
+pub(crate) fn variables_without_key() -> Vec<String> {
+    let names = std::env::vars_os().filter_map(|(name, _)| name.into_string().ok());
+    let is_unknown = |name: &String| {
+        name.strip_prefix(ENVIRONMENT_PREFIX)
+            .is_some_and(|name| name != "BROKER" && !is_of_a_key(name))
+    };
+    names.filter(is_unknown).collect()
+}
+
+/// True if a variable, without its prefix, is of a key or table of the configuration.
+fn is_of_a_key(name: &str) -> bool {
+    static KEYS: LazyLock<&[&str]> = LazyLock::new(|| {
+        // Only serde has the list of keys that are not set.
+        let unknown = Figment::from(Serialized::default("no such key", true));
+        match unknown.extract::<NodeConfig>().map_err(|error| error.kind) {
+            Err(Kind::UnknownField(_, keys)) => keys,
+            _ => &[],
+        }
+    });
+    let first = name.split("__").next().unwrap_or(name);
+    KEYS.iter().any(|key| key.eq_ignore_ascii_case(first))
 }
 
 /// Reads the configuration. The type of a value from the environment (number, list and so on) is
@@ -59,7 +89,7 @@ fn from_environment(error: &figment::Error) -> bool {
 }
 
 /// Keys whose values are never shown.
-const SECRETS: [&str; 4] = ["password", "key", "token", "url"];
+const SECRETS: [&str; 5] = ["password", "key", "token", "url", "pipeline"];
 
 /// Every error with its key and where it was read, and without any secret.
 fn describe(errors: figment::Error) -> String {
@@ -147,5 +177,5 @@ fn without_secrets(text: &str) -> String {
             .iter()
             .fold(line.to_owned(), |line, secret| hide(&line, secret))
     });
-    lines.collect::<Vec<_>>().join("\n")
+    without_logins(&lines.collect::<Vec<_>>().join("\n"))
 }
