@@ -2,6 +2,7 @@
 
 mod files;
 
+use std::io::{BufRead, Read};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -78,8 +79,7 @@ pub(super) struct InviteArguments {
 pub(super) struct JoinArguments {
     /// Token that `ecod-node invite` printed; `-` reads it from standard input, so that the list of
     /// processes does not show it
-    #[arg(value_parser = read_token)]
-    token: Token,
+    token: String,
     #[command(flatten)]
     node: NodeArguments,
 }
@@ -248,11 +248,12 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
 
 /// Gets and keeps the files of an invited node.
 pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
+    let token = read_token(&arguments.token).map_err(Failure::usage)?;
     let directory = arguments.node.directory.vacant()?;
-    let node = &arguments.token.node;
+    let node = &token.node;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let cell = runtime.block_on(async {
-        let joined = redeem(&arguments.token).await?;
+        let joined = redeem(&token).await?;
         directory.write(node, &joined.welcome, &joined.key)?;
         let cell = joined.welcome.cell.clone();
         if let Err(error) = joined.keep().await {
@@ -302,14 +303,23 @@ impl DirectoryArguments {
     }
 }
 
-/// The token in an argument, or in a line of standard input.
+/// Most bytes of a token on standard input, with blanks.
+const MAX_TOKEN_BYTES: u64 = 64 * 1024;
+
+/// The token in an argument, or on standard input, where it may be broken into lines.
 fn read_token(argument: &str) -> anyhow::Result<Token> {
-    let mut line = argument.to_owned();
-    if argument == "-" {
-        line.clear();
-        std::io::stdin().read_line(&mut line)?;
+    if argument != "-" {
+        return Ok(argument.parse()?);
     }
-    Ok(line.parse()?)
+    let mut input = std::io::stdin().lock().take(MAX_TOKEN_BYTES);
+    let mut text = String::new();
+    // A person who pastes a token does not end the input.
+    while input.read_line(&mut text)? > 0 {
+        if let Ok(token) = text.parse() {
+            return Ok(token);
+        }
+    }
+    Ok(text.parse()?)
 }
 
 /// A key of 64 hexadecimal digits.

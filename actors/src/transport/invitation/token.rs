@@ -62,7 +62,14 @@ impl FromStr for Token {
     type Err = TokenError;
 
     fn from_str(text: &str) -> Result<Self, TokenError> {
-        let encoded = text.trim().strip_prefix(PREFIX).ok_or(TokenError)?;
+        // A terminal or a mail program may have broken a long line, and marked a quotation.
+        let is_of_token = |c: &char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+        let is_between = |c: char| c.is_whitespace() || matches!(c, '\u{feff}' | '\u{200b}' | '>');
+        if text.chars().any(|c| !is_of_token(&c) && !is_between(c)) {
+            return Err(TokenError);
+        }
+        let text: String = text.chars().filter(is_of_token).collect();
+        let encoded = text.strip_prefix(PREFIX).ok_or(TokenError)?;
         let bytes = BASE64_URL_SAFE_NO_PAD
             .decode(encoded)
             .map_err(|_| TokenError)?;
@@ -103,6 +110,17 @@ mod tests {
         let text = token.to_string();
         assert!(text.len() < 160, "{text}");
         assert_eq!(format!(" {text}\n").parse(), Ok(token.clone()));
+        for at in 0..text.len() {
+            let (before, after) = text.split_at(at);
+            for blank in ["\n", "\r\n  ", " ", "\n> ", "\u{a0}\u{feff}"] {
+                assert_eq!(
+                    format!("{before}{blank}{after}").parse(),
+                    Ok(token.clone()),
+                    "{blank:?} at {at}"
+                );
+            }
+        }
+        assert!(text.replacen('-', "=", 1).parse::<Token>().is_err());
         assert!(
             !format!("{token:?}").contains("d3") && !format!("{token:?}").contains("211"),
             "{token:?}"
