@@ -133,6 +133,10 @@ struct FixTime {
     captured_at_us: Option<Timestamp>,
 }
 
+/// Time by which the stamp of a pose may be ahead of the clock, in microseconds. Until the clock
+/// reaches such a stamp, all other poses are older than it.
+const MAX_AHEAD_US: i64 = 100_000;
+
 /// Maximum distance from the origin in metres, along each axis.
 const WORLD_M: f64 = 1e8;
 
@@ -156,6 +160,13 @@ pub fn read_pose(
     let captured_at = time
         .captured_at_us
         .map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
+    let ahead_us = captured_at.map_or(0, |captured_at| captured_at.micros_from(now));
+    if ahead_us > MAX_AHEAD_US {
+        let ahead_s = ahead_us as f64 / 1e6;
+        return Err(format!(
+            "`captured_at_us` is {ahead_s:.1} s ahead of this machine's clock, must be Unix time in microseconds"
+        ));
+    }
     let is_on_earth = fix.get("latitude_deg").is_some();
     let pose = if is_on_earth {
         on_earth(&fix).map(StatedPose::OnEarth)
@@ -298,5 +309,25 @@ mod tests {
                 .unwrap_err()
                 .contains("`latitude_deg`")
         );
+    }
+
+    #[test]
+    fn a_stamp_ahead_of_the_clock_is_refused_by_itself() {
+        let now = Timestamp(1_732_154_400_000_000);
+        let read = |stamp: String| {
+            let text = format!(r#"{{"x_m":1,"y_m":2,"heading_rad":0,"captured_at_us":{stamp}}}"#);
+            read_pose(text.as_bytes(), now, 0)
+        };
+        for ahead_us in [-5_000_000_i64, 0, 50_000] {
+            let stamp = now.shifted(ahead_us);
+            assert_eq!(read(stamp.micros().to_string()).unwrap().0, stamp);
+        }
+        for ahead_us in [1_000_000, 3_600_000_000, i64::MAX / 2] {
+            let stamp = now.shifted(ahead_us).micros().to_string();
+            let error = read(stamp).unwrap_err();
+            assert!(error.contains("s ahead of this machine's clock"), "{error}");
+        }
+        let nanoseconds = format!("{}000", now.micros());
+        assert!(read(nanoseconds).is_err());
     }
 }
