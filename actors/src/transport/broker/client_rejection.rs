@@ -17,6 +17,8 @@ pub(super) enum ClientRejection {
     Untrusted(String),
     #[error("not an MQTT login, or a packet of too many filters")]
     Malformed,
+    #[error("protocol level {0} is not one of MQTT 3.1, 3.1.1 and 5")]
+    UnknownVersion(u8),
     #[error("as many clients as allowed are connected")]
     Full,
     #[error("as many clients as allowed are connected of this certificate or address")]
@@ -37,7 +39,9 @@ impl ClientRejection {
             Self::TimedOut => Some(Event::ClientTimedOut),
             Self::Evicted => Some(Event::ClientThrottled),
             Self::Untrusted(_) => Some(Event::ClientUntrusted),
-            Self::Malformed | Self::Lost(_) => Some(Event::ClientMalformed),
+            Self::Malformed | Self::UnknownVersion(_) | Self::Lost(_) => {
+                Some(Event::ClientMalformed)
+            }
             Self::Full | Self::Crowded => Some(Event::ClientsFull),
             Self::Stalled => Some(Event::ClientStalled),
             Self::CertificateInvalidated(_) => Some(Event::ClientExpelled),

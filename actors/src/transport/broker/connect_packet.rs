@@ -1,5 +1,7 @@
 //! The CONNECT packet of a client.
 
+use std::ops::RangeInclusive;
+
 use tokio::io::{AsyncRead, AsyncReadExt};
 
 use super::client_rejection::ClientRejection;
@@ -22,6 +24,13 @@ const CONNECT: u8 = 0x10;
 
 /// The protocol level of MQTT 5, in which properties come before the client id.
 const MQTT_5: u8 = 5;
+
+/// Protocol levels of MQTT 3.1, 3.1.1 and 5.
+const LEVELS: RangeInclusive<u8> = 3..=MQTT_5;
+
+/// CONNACK with the return code "unacceptable protocol version" (MQTT 3.1.1, 3.2.2.3). A bridge of
+/// mosquitto, which first asks with the level 0x84, then asks with 4.
+pub(super) const UNKNOWN_VERSION: [u8; 4] = [0x20, 2, 0, 1];
 
 /// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first
 /// bytes forever.
@@ -47,6 +56,9 @@ pub(super) async fn read(
     }
     let mut body = vec![0; length];
     stream.read_exact(&mut body).await?;
+    if let Some(level) = level(&body).filter(|level| !LEVELS.contains(level)) {
+        return Err(ClientRejection::UnknownVersion(level));
+    }
     let client_id = client_id(&body);
     let has_generated_id = client_id.is_some_and(<[u8]>::is_empty);
     let client_id = String::from_utf8_lossy(client_id.unwrap_or_default()).into_owned();
@@ -74,6 +86,11 @@ pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
         "rmqtt gets what the client sent"
     );
     Some(login.packet.len())
+}
+
+/// The protocol level in the body of a CONNECT packet.
+fn level(body: &[u8]) -> Option<u8> {
+    text(body)?.1.first().copied()
 }
 
 /// The client id in the body of a CONNECT packet; `None` if rmqtt will find the packet malformed.
@@ -105,6 +122,24 @@ fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test]
+    async fn other_protocol_levels_are_told_from_malformed_packets() {
+        for (level, name) in [(0x84, "MQTT"), (0x83, "MQIsdp"), (6, "MQTT"), (0, "MQTT")] {
+            let body = [
+                &[0, name.len() as u8],
+                name.as_bytes(),
+                &[level, 2, 0, 60, 0, 1, b'x'],
+            ]
+            .concat();
+            let packet = [&[body.len() as u8], &body[..]].concat();
+            let refusal = read(CONNECT, &mut &packet[..]).await.unwrap_err();
+            assert!(
+                matches!(refusal, ClientRejection::UnknownVersion(found) if found == level),
+                "{refusal}"
+            );
+        }
+    }
 
     #[tokio::test]
     async fn clients_that_name_themselves_are_told_from_those_that_do_not() {

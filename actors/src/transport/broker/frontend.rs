@@ -238,8 +238,12 @@ impl FrontendState {
                 stream = Box::pin(websocket::accept(stream, Arc::clone(&wire_bytes)).await?);
                 first = stream.read_u8().await?;
             }
-            let connect = connect_packet::read(first, &mut stream).await?;
-            Ok((stream, certificates, connect))
+            let connect = connect_packet::read(first, &mut stream).await;
+            if let Err(ClientRejection::UnknownVersion(_)) = connect {
+                stream.write_all(&connect_packet::UNKNOWN_VERSION).await?;
+                stream.shutdown().await?;
+            }
+            Ok((stream, certificates, connect?))
         };
         let login = tokio::select! {
             login = timeout_at(Instant::now() + self.handshake_timeout, login) => login.unwrap_or(Err(ClientRejection::TimedOut)),
