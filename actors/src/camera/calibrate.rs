@@ -3,6 +3,7 @@
 pub mod board;
 pub mod mount;
 
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
@@ -15,11 +16,22 @@ use serde::{Deserialize, Serialize};
 use crate::camera::frame_source::images;
 use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
-use crate::camera::lens::Lens;
+use crate::camera::lens::{Distortion, Lens};
 use crate::platform::bounded_file;
 
 /// Minimum number of photographs that show the whole board.
 pub const MIN_VIEWS: usize = 5;
+
+/// Numbers of coefficients of OpenCV's polynomial models without and with k3, and of the rational
+/// one.
+const COEFFICIENT_COUNTS: [usize; 3] = [4, 5, 8];
+
+/// Fields of view of real lenses, in degrees: a focal length in millimetres or in shares of the
+/// image is beyond.
+const PLAUSIBLE_FOV_DEG: RangeInclusive<f64> = 0.2..=175.0;
+
+/// Places of the principal point, in shares of the image.
+const PLAUSIBLE_MIDDLE: RangeInclusive<f64> = 0.02..=0.98;
 
 /// A printed chessboard.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,8 +60,8 @@ pub struct Calibration {
     pub cx: f64,
     /// Row of the principal point in pixels.
     pub cy: f64,
-    /// OpenCV's k1, k2, p1, p2, k3.
-    pub distortion: [f64; 5],
+    /// OpenCV's k1, k2, p1, p2, then perhaps k3, then perhaps k4, k5, k6 of the rational model.
+    pub distortion: Vec<f64>,
     /// Root mean square distance in pixels between found and reprojected corners; good is below
     /// 0.5.
     pub rms_px: f64,
@@ -209,9 +221,12 @@ impl Calibration {
             fy,
             cx,
             cy,
-            distortion,
             ..
         } = *self;
+        let mut distortion = Distortion::default();
+        for (coefficient, stated) in distortion.iter_mut().zip(&self.distortion) {
+            *coefficient = *stated;
+        }
         let distorts = distortion.iter().any(|k| *k != 0.0);
         Lens {
             distortion: distorts.then_some(distortion),
@@ -245,7 +260,37 @@ impl Calibration {
                 "image size and focal lengths must be positive, all numbers finite".into(),
             ));
         }
+        read.check_model().map_err(malformed)?;
         Ok(read)
+    }
+
+    /// Checks the count of coefficients, and that lengths are in pixels of the image.
+    fn check_model(&self) -> Result<(), String> {
+        let count = self.distortion.len();
+        if !COEFFICIENT_COUNTS.contains(&count) {
+            return Err(format!(
+                "`distortion` has {count} coefficients, must have 4, 5 or 8: k1, k2, p1, p2, k3, k4, k5, k6; calibrate again without further ones, and fisheye lenses not at all"
+            ));
+        }
+        let sides = [
+            (self.image_width, ["fx", "cx"], [self.fx, self.cx]),
+            (self.image_height, ["fy", "cy"], [self.fy, self.cy]),
+        ];
+        for (side, [focal_key, middle_key], [focal, middle]) in sides {
+            let side = f64::from(side);
+            let angle_deg = (2.0 * (side / (2.0 * focal)).atan()).to_degrees();
+            if !PLAUSIBLE_FOV_DEG.contains(&angle_deg) {
+                return Err(format!(
+                    "`{focal_key}` is {focal}, a field of view of {angle_deg:.1}°: it must be in pixels of an image of {side} px"
+                ));
+            }
+            if !PLAUSIBLE_MIDDLE.contains(&(middle / side)) {
+                return Err(format!(
+                    "`{middle_key}` is {middle}, at the edge or outside of an image of {side} px: it must be in its pixels"
+                ));
+            }
+        }
+        Ok(())
     }
 
     /// Writes a calibration file.
@@ -302,10 +347,7 @@ fn solve(
         stop_after(100, 1e-9)?,
     )?;
     let entry = |row, column| camera.at_2d::<f64>(row, column).copied();
-    let mut coefficients = [0.0; 5];
-    for (index, coefficient) in (0..).zip(&mut coefficients) {
-        *coefficient = *distortion.at::<f64>(index)?;
-    }
+    let coefficients = (0..5).map(|index| distortion.at::<f64>(index).copied());
     Ok(Calibration {
         image_width: size.width,
         image_height: size.height,
@@ -313,7 +355,7 @@ fn solve(
         fy: entry(1, 1)?,
         cx: entry(0, 2)?,
         cy: entry(1, 2)?,
-        distortion: coefficients,
+        distortion: coefficients.collect::<opencv::Result<_>>()?,
         rms_px,
         images,
     })

@@ -8,13 +8,16 @@ use opencv::core::{Mat, Matx33d, Point2d, Vector};
 
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 
+/// OpenCV's k1, k2, p1, p2, k3, k4, k5, k6; the last three are 0 unless the model is rational.
+pub type Distortion = [f64; 8];
+
 /// A calibrated camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
     /// Focal lengths and principal point, in pixels.
     pub intrinsics: Intrinsics,
-    /// OpenCV's k1, k2, p1, p2, k3; `None` for an ideal lens.
-    pub distortion: Option<[f64; 5]>,
+    /// `None` for an ideal lens.
+    pub distortion: Option<Distortion>,
     /// True if frames may have any shape; the horizontal field of view then applies to all of them.
     pub is_any_shape: bool,
 }
@@ -184,7 +187,7 @@ pub(crate) fn camera_matrix(intrinsics: &Intrinsics) -> Matx33d {
 mod tests {
     use super::*;
 
-    const DISTORTION: [f64; 5] = [-0.3, 0.1, 0.001, -0.002, 0.0];
+    const DISTORTION: Distortion = [-0.3, 0.1, 0.001, -0.002, 0.0, 0.05, 0.02, 0.01];
 
     fn camera() -> Intrinsics {
         Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians())
@@ -193,10 +196,11 @@ mod tests {
     /// The Brown-Conrady model, as written in OpenCV's documentation of `calib3d`.
     fn distorted(ideal: Point2<f64>) -> Point2<f64> {
         let Intrinsics { fx, fy, cx, cy, .. } = camera();
-        let [k1, k2, p1, p2, k3] = DISTORTION;
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = DISTORTION;
         let (x, y) = ((ideal.x - cx) / fx, (ideal.y - cy) / fy);
         let r2 = x * x + y * y;
-        let radial = 1.0 + k1 * r2 + k2 * r2 * r2 + k3 * r2 * r2 * r2;
+        let polynomial = |a, b, c| 1.0 + a * r2 + b * r2 * r2 + c * r2 * r2 * r2;
+        let radial = polynomial(k1, k2, k3) / polynomial(k4, k5, k6);
         Point2::new(
             cx + fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)),
             cy + fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y),

@@ -70,7 +70,7 @@ pub struct CapturedPicture {
     pub height: u32,
     /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for
     /// another shape.
-    pub optics: Option<(Intrinsics, Option<[f64; 5]>)>,
+    pub optics: Option<(Intrinsics, Option<[f64; 8]>)>,
     /// Detections in pixels of the picture, before distortion is removed.
     pub detections: Vec<Detection>,
 }

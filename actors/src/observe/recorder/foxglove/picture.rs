@@ -30,7 +30,7 @@ pub(crate) struct CameraCalibration {
     height: u32,
     distortion_model: &'static str,
     #[serde(rename = "D")]
-    distortion: [f64; 5],
+    distortion: Vec<f64>,
     #[serde(rename = "K")]
     intrinsics: [f64; 9],
     #[serde(rename = "R")]
@@ -119,13 +119,24 @@ impl CameraCalibration {
     pub(crate) fn of(picture: &CapturedPicture) -> Option<Self> {
         let (camera, distortion) = picture.optics?;
         let (fx, fy, cx, cy) = (camera.fx, camera.fy, camera.cx, camera.cy);
+        let coefficients = distortion.unwrap_or_default();
+        let (polynomial, denominator) = coefficients.split_at(5);
+        let is_rational = denominator.iter().any(|k| *k != 0.0);
         Some(Self {
             timestamp: picture.captured_at.into(),
             frame_id: optical_frame(&picture.reporter),
             width: camera.width,
             height: camera.height,
-            distortion_model: "plumb_bob",
-            distortion: distortion.unwrap_or_default(),
+            distortion_model: if is_rational {
+                "rational_polynomial"
+            } else {
+                "plumb_bob"
+            },
+            distortion: if is_rational {
+                coefficients.to_vec()
+            } else {
+                polynomial.to_vec()
+            },
             intrinsics: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
             rectification: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             projection: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
