@@ -18,6 +18,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import Publisher, Server, free_port, wait_for
 from test_codec import MAP
@@ -202,6 +203,29 @@ def test_values_that_are_not_allowed_are_not_sent_and_cost_no_number(cell: ecod.
             send()
     assert cell.report([CAR])
     assert heard.get(timeout=20)[1]["seq"] == 1
+
+
+def test_arguments_of_the_wrong_shape_are_not_sent(cell: ecod.Cell) -> None:
+    car = ecod.PerceivedObject("car", 0.9, x_m=1, y_m=2)
+    wrong: list[tuple[str, dict[str, Any]]] = [
+        ("pose: .* x_m, y_m, heading_rad", {"pose": (1, 2)}),
+        ("pose", {"pose": np.eye(3)}),
+        ("pose.y_m", {"pose": (1, math.nan, 2)}),
+        ("pose", {"pose": 5}),
+        ("objects", {"objects": None}),
+        ("objects", {"objects": car}),
+        ("objects.0.", {"objects": [5]}),
+        ("seen", {"seen": "slot-1"}),
+        ("seen", {"seen": 5}),
+        ("view", {"view": (10, 1)}),
+    ]
+    for place, named in wrong:
+        with pytest.raises(ecod.Invalid, match=f"not sent: {place}"):
+            cell.report(**{"objects": [car], **named})
+    for objects in (None, [5], "ab"):
+        with pytest.raises(ecod.Invalid, match="not sent: objects"):
+            cell.vote(objects)  # type: ignore[arg-type]
+    assert cell.report([car], pose=np.array([1.0, 2, 3]))  # type: ignore[arg-type]
 
 
 def test_defaults_come_from_the_environment(broker: Server, monkeypatch: pytest.MonkeyPatch) -> None:

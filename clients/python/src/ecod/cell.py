@@ -11,10 +11,11 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from datetime import datetime
 from typing import Any, Optional, TypeVar, Union
 
-from .codec import Rejected, encode
+from .codec import Rejected, encode, is_list
 from .connection import Connection, host_and_port, log, tls_context
 from .errors import Invalid, Silent
 from .geo import Origin
@@ -148,7 +149,7 @@ class Cell:
         without a connection it is dropped and counted. Raises `Invalid` for values that the protocol does not allow, and
         `Refused` when the broker refused an earlier report.
         """
-        return self._report("detections", list(objects), captured_at, pose, seen, view, frame_yaw_rate_radps)
+        return self._report("detections", _listed("objects", objects), captured_at, pose, seen, view, frame_yaw_rate_radps)
 
     def vote(
         self,
@@ -159,11 +160,13 @@ class Cell:
         seen: Optional[Iterable[str]] = None,
     ) -> bool:
         """Votes on what is at known locations, for the verdicts: objects name their `landmark`. The rest is as in `report`."""
-        objects = list(objects)
-        for place, item in enumerate(objects):
+        listed = _listed("objects", objects)
+        for place, item in enumerate(listed):
+            if not isinstance(item, (PerceivedObject, Mapping)):
+                raise Invalid(f"not sent: objects[{place}]: {item!r} must be PerceivedObject")
             if not (item.get("landmark") if isinstance(item, Mapping) else item.landmark):
                 raise Invalid(f"not sent: objects[{place}].landmark: is missing, a vote is on a known location")
-        return self._report("vote_detections", objects, captured_at, pose, seen, None)
+        return self._report("vote_detections", listed, captured_at, pose, seen, None)
 
     def close(self) -> None:
         """Ends the connection, and with it all loops over messages."""
@@ -224,8 +227,7 @@ class Cell:
         frame_yaw_rate_radps: Optional[float] = None,
     ) -> bool:
         full_topic = f"{self._root}{topic}/{self.name}"
-        pose = Pose(*pose) if isinstance(pose, (tuple, list)) else pose
-        seen = None if seen is None else list(seen)
+        seen = None if seen is None else _listed("seen", seen)
         with self._sending:
             seq = self._seq[topic] + 1
             report = ObjectReport(
@@ -234,7 +236,7 @@ class Cell:
                 seq,
                 micros(captured_at),
                 objects,
-                pose,
+                _pose(pose),
                 seen,
                 view,
                 frame_yaw_rate_radps=frame_yaw_rate_radps,
@@ -264,6 +266,22 @@ class Cell:
                         # An order that is not kept is usual after a reconnection.
                         level = logging.INFO if reason in ("superseded", "repeated") else logging.WARNING
                         log.log(level, "not taken from %s, %s: %s; others like it are only counted", topic, reason, text)
+
+
+def _pose(given: Any) -> Any:
+    """A pose in place of its numbers in a tuple, list or array."""
+    if not is_list(given):
+        return given
+    if not 3 <= len(given) <= len(fields(Pose)):
+        raise Invalid(f"not sent: pose: {given!r} must be the numbers x_m, y_m, heading_rad")
+    return Pose(*given)
+
+
+def _listed(name: str, items: Any) -> list[Any]:
+    """The items of anything that has several."""
+    if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Iterable):
+        raise Invalid(f"not sent: {name}: {items!r} must be a list")
+    return list(items)
 
 
 def micros(moment: Optional[Time]) -> int:

@@ -6,6 +6,7 @@ import json
 import math
 import numbers
 import uuid
+from collections.abc import Mapping, Set
 from dataclasses import MISSING, fields, is_dataclass
 from functools import lru_cache
 from typing import Annotated, Any, Callable, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
@@ -115,7 +116,12 @@ def _ruled(inner: Reader, rule: Rule, in_millimetres: bool) -> Reader:
 def _float(value: Any, _is_compact: bool) -> Any:
     # The test of the type itself is only faster.
     is_number = type(value) is float or isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return float(value) if is_number and math.isfinite(value) else _fail(value, "must be a finite number")
+    try:
+        if is_number and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # a whole number of more than 1024 bits
+        pass
+    return _fail(value, "must be a finite number")
 
 
 def _int(value: Any, _is_compact: bool) -> Any:
@@ -147,11 +153,49 @@ def _word(words: tuple[str, ...]) -> Reader:
     return read
 
 
+def is_list(value: Any) -> bool:
+    """Whether a value has parts in an order: a list, a tuple or an array of at least one dimension."""
+    if isinstance(value, (str, bytes, Mapping, Set)) or not hasattr(value, "__getitem__"):
+        return False
+    try:
+        return len(value) >= 0
+    except TypeError:  # an array without dimensions
+        return False
+
+
+def number_of(value: Any, place: str) -> float:
+    """A finite number in any type that has one, also of numpy and torch.
+
+    Raises `Invalid` with the place.
+    """
+    try:
+        if isinstance(value, (str, bytes, bool)):
+            _fail(value, "must be a finite number")
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            _fail(value, "must be a finite number")
+        return float(_float(number, False))
+    except Flaw as flaw:
+        raise Invalid(f"{place}: {flaw}") from None
+
+
+def numbers_of(values: Any, names: str, place: str) -> tuple[float, ...]:
+    """As many finite numbers as there are names.
+
+    Raises `Invalid` with the place.
+    """
+    if not is_list(values) or len(values) != len(names.split()):
+        shown = repr(values)
+        raise Invalid(f"{place}: {shown if len(shown) <= 60 else shown[:60] + '…'} must be the numbers {', '.join(names.split())}")
+    return tuple(number_of(value, f"{place}[{index}]") for index, value in enumerate(values))
+
+
 def _sequence(kind: Any, inner: list[Reader]) -> Reader:
     """A list of any length, or a tuple of as many parts as it has readers."""
 
     def read(value: Any, is_compact: bool) -> Any:
-        if isinstance(value, (str, bytes, dict)) or not hasattr(value, "__len__"):
+        if not is_list(value):
             _fail(value, "must be a list")
         if kind is tuple and len(value) != len(inner):
             _fail(value, f"must be a list of {len(inner)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Optional
 
+from .codec import is_list, number_of, numbers_of
 from .errors import Invalid
 from .messages import PerceivedObject
 
@@ -19,28 +20,36 @@ def from_arrays(
 ) -> list[PerceivedObject]:
     """Objects from numpy arrays or lists of equal length.
 
-    `positions` and `velocities` are [east, north]. `covariances` are [xx, xy, yy], or matrices of 2 × 2.
+    `positions` and `velocities` are [east, north]. `covariances` are [xx, xy, yy], or symmetric matrices of 2 × 2.
+    Raises `Invalid` with the row for values of another shape and for numbers that are not finite.
     """
-    number = len(labels)
+    number = _rows("labels", labels)
     for name, array in (
         ("confidences", confidences),
         ("positions", positions),
         ("covariances", covariances),
         ("velocities", velocities),
     ):
-        if array is not None and len(array) != number:
+        if array is not None and _rows(name, array) != number:
             raise Invalid(f"{name} has {len(array)} rows, labels has {number}")
-    return [
-        PerceivedObject(
-            label=str(labels[row]),
-            confidence=float(confidences[row]),
-            x_m=float(positions[row][0]),
-            y_m=float(positions[row][1]),
-            covariance_m2=None if covariances is None else _covariance(covariances[row]),
-            velocity_mps=None if velocities is None else (float(velocities[row][0]), float(velocities[row][1])),
+    objects = []
+    for row in range(number):
+        x_m, y_m = numbers_of(positions[row], "east north", f"positions[{row}]")
+        velocity = None
+        if velocities is not None:
+            east, north = numbers_of(velocities[row], "east north", f"velocities[{row}]")
+            velocity = (east, north)
+        objects.append(
+            PerceivedObject(
+                label=str(labels[row]),
+                confidence=number_of(confidences[row], f"confidences[{row}]"),
+                x_m=x_m,
+                y_m=y_m,
+                covariance_m2=None if covariances is None else _covariance(covariances[row], f"covariances[{row}]"),
+                velocity_mps=velocity,
+            )
         )
-        for row in range(number)
-    ]
+    return objects
 
 
 def from_supervision(detections: Any, positions: Any, *, names: Optional[Mapping[int, str]] = None) -> list[PerceivedObject]:
@@ -48,16 +57,34 @@ def from_supervision(detections: Any, positions: Any, *, names: Optional[Mapping
 
     Labels are the detections' own class names, or those of `names` by class.
     """
+    missing = [name for name in ("confidence", "class_id", "data") if not hasattr(detections, name)]
+    if missing:
+        raise Invalid(f"{type(detections).__name__} has no {missing[0]}: it must be supervision.Detections")
     if detections.confidence is None:
         raise Invalid("the detections have no confidence")
     labels: Optional[Iterable[Any]] = detections.data.get("class_name")
     if names is not None and detections.class_id is not None:
-        labels = [names[int(number)] for number in detections.class_id]
+        try:
+            labels = [names[int(number)] for number in detections.class_id]
+        except (LookupError, TypeError, ValueError) as error:
+            raise Invalid(f"`names` must have a name for every class of the detections: {error!r}") from None
     if labels is None:
         raise Invalid("the detections have no class names; give them as `names`, by class")
     return from_arrays(list(labels), detections.confidence, positions)
 
 
-def _covariance(given: Any) -> tuple[float, float, float]:
-    xx, xy, yy = given if len(given) == 3 else (given[0][0], given[0][1], given[1][1])
-    return float(xx), float(xy), float(yy)
+def _rows(name: str, array: Any) -> int:
+    if not is_list(array):
+        raise Invalid(f"{name} must be a list or an array with one row for each detection, not {type(array).__name__}")
+    return len(array)
+
+
+def _covariance(given: Any, place: str) -> tuple[float, float, float]:
+    if is_list(given) and len(given) == 2:
+        xx, xy = numbers_of(given[0], "xx xy", f"{place}[0]")
+        yx, yy = numbers_of(given[1], "xy yy", f"{place}[1]")
+        if abs(xy - yx) > 1e-6 * (abs(xx) + abs(yy)):
+            raise Invalid(f"{place}: a covariance is a symmetric matrix, but has {xy} and {yx} beside its diagonal")
+        return xx, xy, yy
+    xx, xy, yy = numbers_of(given, "xx xy yy", place)
+    return xx, xy, yy

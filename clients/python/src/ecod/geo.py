@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
-from math import atan2, cos, degrees, hypot, isfinite, radians, sin, sqrt
+from math import atan2, cos, degrees, hypot, radians, sin, sqrt
 from typing import Optional
 
+from .codec import number_of
 from .errors import Invalid
 from .messages import Pose
 
@@ -38,9 +39,11 @@ class Origin:
     rotation_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.latitude_deg, self.longitude_deg, self.height_m, self.rotation_rad)
-        if not all(map(isfinite, values)) or abs(self.latitude_deg) > 90 or abs(self.longitude_deg) > 360:
-            raise Invalid(f"{self} must have a latitude of ±90°, a longitude of ±360°, and finite numbers")
+        try:
+            _check_place(self.latitude_deg, self.longitude_deg, self.height_m)
+            number_of(self.rotation_rad, "rotation_rad")
+        except Invalid as error:
+            raise Invalid(f"{self}: {error}") from None
 
     @staticmethod
     @lru_cache(maxsize=4)
@@ -59,16 +62,19 @@ class Origin:
         """Latitude and longitude in degrees, and height above the ellipsoid, of a position in the map.
 
         `z_m` is the height above the tangent plane. Without it latitude and longitude of what stands on the ground are
-        right to 2 mm within 5 km, and the height is up to 2 m too large.
+        right to 2 mm within 5 km, and the height is up to 2 m too large. Raises `Invalid` for what is no finite number.
         """
+        x_m, y_m, z_m = (number_of(value, name) for value, name in ((x_m, "x_m"), (y_m, "y_m"), (z_m, "z_m")))
         x, y, z = (a + b for a, b in zip(_ecef(self.latitude_deg, self.longitude_deg, self.height_m), self._to_earth(x_m, y_m, z_m)))
         return _geodetic(x, y, z)
 
     def to_map(self, latitude_deg: float, longitude_deg: float, height_m: Optional[float] = None) -> tuple[float, float, float]:
         """The position in the map of a place on Earth: x, y, and height above the tangent plane, in metres.
 
-        Without a height, that of the origin counts.
+        Without a height, that of the origin counts. Raises `Invalid` for a latitude beyond ±90°, as of swapped arguments, a
+        longitude beyond ±360°, and what is no finite number.
         """
+        _check_place(latitude_deg, longitude_deg, height_m)
         there = _ecef(latitude_deg, longitude_deg, self.height_m if height_m is None else height_m)
         x, y, z = (a - b for a, b in zip(there, _ecef(self.latitude_deg, self.longitude_deg, self.height_m)))
         return self._from_earth(x, y, z)
@@ -79,6 +85,7 @@ class Origin:
         Without a height, that of the origin counts: 10 m of error move a pose that is 5 km away by 8 mm. Raises `Invalid`
         for a place that is more than 100 km away.
         """
+        azimuth_deg = number_of(azimuth_deg, "azimuth_deg")
         height_m = self.height_m if height_m is None else height_m
         there = Origin(latitude_deg, longitude_deg, height_m)
         x, y, z = self.to_map(latitude_deg, longitude_deg, height_m)
@@ -111,6 +118,16 @@ class Origin:
     def _angles(self) -> tuple[float, float, float, float]:
         lat, lon = radians(self.latitude_deg), radians(self.longitude_deg)
         return sin(lat), cos(lat), sin(lon), cos(lon)
+
+
+def _check_place(latitude_deg: float, longitude_deg: float, height_m: Optional[float]) -> None:
+    for value, name, most in (
+        (latitude_deg, "latitude_deg", 90.0),
+        (longitude_deg, "longitude_deg", 360.0),
+        (0.0 if height_m is None else height_m, "height_m", 1e8),
+    ):
+        if abs(number_of(value, name)) > most:
+            raise Invalid(f"{name}: {value} must be from {-most:g} to {most:g}")
 
 
 def _ecef(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float, float]:

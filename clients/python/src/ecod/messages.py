@@ -37,7 +37,10 @@ def _at_most(number: int) -> Rule:
 
 def _is_label(text: str) -> bool:
     has_controls = any(ord(character) < 32 or 127 <= ord(character) < 160 for character in text)
-    return 1 <= len(text.encode("utf-8", "replace")) <= 64 and not has_controls
+    try:
+        return 1 <= len(text.encode()) <= 64 and not has_controls
+    except UnicodeEncodeError:  # half of a character, which no encoding has
+        return False
 
 
 def _is_uuid(text: str) -> bool:
@@ -60,7 +63,7 @@ def is_name(text: str) -> bool:
 Schema = Annotated[int, Rule(lambda value: value == SCHEMA_VERSION, "is unknown: this package reads version 1")]
 Count = Annotated[int, Rule(lambda value: 0 <= value < 2**53, "must be from 0 to 2⁵³ − 1")]
 Name = Annotated[str, Rule(is_name, "must be 1 to 64 of A-Z a-z 0-9 _ -")]
-Label = Annotated[str, Rule(_is_label, "must have 1 to 64 bytes and no control characters")]
+Label = Annotated[str, Rule(_is_label, "must have 1 to 64 bytes in UTF-8 and no control characters")]
 Uuid = Annotated[str, Rule(_is_uuid, "must be a UUID")]
 Hash = Annotated[str, Rule(lambda text: re.fullmatch("[0-9a-f]{64}", text) is not None, "must be 64 hexadecimal digits")]
 Fraction = Annotated[float, _between(0, 1)]
