@@ -64,6 +64,16 @@ pub enum DetectError {
         /// Count of labels.
         labels: usize,
     },
+    /// The model's outputs are not those of its family.
+    #[error(
+        "the outputs of the model contradict the family {family}: {what}; set `family` and `first_class`, or export the model as docs/cameras.md lists"
+    )]
+    Contradiction {
+        /// The family in use.
+        family: String,
+        /// The contradiction.
+        what: String,
+    },
     /// The decoder refused the image.
     #[error("placard decoder failed: {0}")]
     Decoder(String),

@@ -7,6 +7,7 @@ mod decode;
 mod family;
 mod labels;
 mod letterbox;
+mod literal;
 mod network;
 
 use std::collections::BTreeMap;
@@ -15,11 +16,13 @@ use std::path::PathBuf;
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::Detection;
 use ecod::model::names::Label;
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 
 pub use self::family::{Family, Normalization};
 
-use self::family::{Clues, Head};
+use self::family::{Clues, Head, NoHead};
+use self::labels::StatedNames;
 use self::letterbox::Letterbox;
 use self::network::{NamedTensor, Network};
 use super::candidates::{ScoredBox, suppress};
@@ -42,11 +45,15 @@ pub struct OnnxConfig {
     #[serde(default)]
     pub family: Option<Family>,
     /// Width and height of the network's input in pixels. Default: not set; taken from the model.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "two_sides")]
     pub input_px: Option<[u16; 2]>,
     /// Range of pixel values. Default: not set; the family's values.
     #[serde(default)]
     pub normalization: Option<Normalization>,
+    /// Number of the first class in the outputs: 0, or 1 where 0 is the background. Default: not
+    /// set; the family's number.
+    #[serde(default)]
+    pub first_class: Option<u8>,
     /// Minimum confidence of a detection. Default 0.4.
     #[serde(default = "default_threshold")]
     pub threshold: f64,
@@ -63,6 +70,17 @@ fn default_threshold() -> f64 {
     0.4
 }
 
+/// Reads two numbers; TOML's own reader would drop a third.
+fn two_sides<'de, D: Deserializer<'de>>(source: D) -> Result<Option<[u16; 2]>, D::Error> {
+    let Some(sides) = Option::<Vec<u16>>::deserialize(source)? else {
+        return Ok(None);
+    };
+    let sides = <[u16; 2]>::try_from(sides).map_err(|sides| {
+        D::Error::invalid_length(sides.len(), &"width and height, such as [640, 480]")
+    })?;
+    Ok(Some(sides))
+}
+
 fn default_max_overlap() -> f64 {
     0.5
 }
@@ -76,6 +94,7 @@ impl OnnxConfig {
             family: None,
             input_px: None,
             normalization: None,
+            first_class: None,
             threshold: default_threshold(),
             thresholds: BTreeMap::new(),
             max_overlap: default_max_overlap(),
@@ -89,6 +108,9 @@ impl OnnxConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         for side in self.input_px.into_iter().flatten() {
             check_range("input_px", f64::from(side), 32.0, 4096.0)?;
+        }
+        if let Some(first) = self.first_class {
+            check_range("first_class", f64::from(first), 0.0, 1.0)?;
         }
         check_range("threshold", self.threshold, 0.01, 1.0)?;
         for (label, threshold) in &self.thresholds {
@@ -177,6 +199,70 @@ pub enum OnnxError {
         /// The configured family, or all.
         family: String,
     },
+    /// The model has another task than to find boxes.
+    #[error(
+        "model {path:?} is a model for {task}, but a node needs boxes parallel to the image's edges: export a model for detection"
+    )]
+    OtherTask {
+        /// Path of the model file.
+        path: PathBuf,
+        /// The task in words.
+        task: String,
+    },
+    /// The numbers of the classes are unknown.
+    #[error(
+        "model {path:?} lists numbers of classes in {outputs}: set `first_class` to 0 or, if 0 is the background, to 1"
+    )]
+    UnknownFirstClass {
+        /// Path of the model file.
+        path: PathBuf,
+        /// Names and shapes.
+        outputs: String,
+    },
+    /// The names in the metadata cannot be read.
+    #[error(
+        "the `names` in the metadata of model {path:?} cannot be read: {fault}; set `labels` to a file with one on each line"
+    )]
+    BadNames {
+        /// Path of the model file.
+        path: PathBuf,
+        /// The fault.
+        fault: String,
+    },
+    /// The names in the metadata have other numbers than the outputs.
+    #[error(
+        "the `names` in the metadata of model {path:?} begin with class {stated}, but classes of {family} begin with {first}: set `first_class`, or `labels` to a file with one on each line"
+    )]
+    OtherFirstClass {
+        /// Path of the model file.
+        path: PathBuf,
+        /// Number of the first name.
+        stated: usize,
+        /// The family in use.
+        family: String,
+        /// Number of its first class.
+        first: usize,
+    },
+    /// The names in the metadata are not as many as the outputs have classes.
+    #[error(
+        "model {path:?} has {names} names in its metadata, but {outputs} are for {classes} classes: export a model for detection, without other values beside boxes and scores"
+    )]
+    NameCount {
+        /// Path of the model file.
+        path: PathBuf,
+        /// Count of names.
+        names: usize,
+        /// Names and shapes.
+        outputs: String,
+        /// Count of classes.
+        classes: usize,
+    },
+    /// The network takes bytes, so that no other range of values is possible.
+    #[error("model {path:?} takes bytes, 0 to 255: remove `normalization`")]
+    TakesBytes {
+        /// Path of the model file.
+        path: PathBuf,
+    },
     /// A YOLOX model with other outputs than its family's.
     #[error(
         "model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`"
@@ -190,7 +276,7 @@ pub enum OnnxError {
         "{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order"
     )]
     LabelCount {
-        /// The file of the labels or of the model.
+        /// The file of the labels.
         path: PathBuf,
         /// Count of labels.
         labels: usize,
@@ -255,6 +341,19 @@ impl OnnxDetector {
             height: height.into(),
         });
         let network = Network::load(path, told)?;
+        if let Some(task) = network.metadata("task").and_then(other_task) {
+            return Err(OnnxError::OtherTask {
+                path: path.clone(),
+                task,
+            });
+        }
+        if network.takes_bytes()
+            && config
+                .normalization
+                .is_some_and(|n| n != Normalization::Raw)
+        {
+            return Err(OnnxError::TakesBytes { path: path.clone() });
+        }
         let size = network.input_size();
         let outputs = network
             .run(vec![0.0; 3 * size.width as usize * size.height as usize])
@@ -270,26 +369,50 @@ impl OnnxDetector {
                 },
             })?;
         let (names, names_path) = names(&config, &network)?;
+        let is_of_model = config.labels.is_none();
         let description = ["description", "head"]
             .map(|key| network.metadata(key).unwrap_or_default())
             .join(" ");
         let clues = Clues {
             told: config.family,
+            first_class: config.first_class,
             description: &description,
             input: size,
             scales_boxes: network.scales_boxes(),
         };
-        let head =
-            Head::find(&clues, &outputs).ok_or_else(|| unknown_outputs(&config, size, &outputs))?;
+        let head = Head::find(&clues, &outputs).map_err(|reason| match reason {
+            NoHead::UnknownOutputs => unknown_outputs(&config, size, &outputs),
+            NoHead::UnknownFirstClass => OnnxError::UnknownFirstClass {
+                path: path.clone(),
+                outputs: listed(&outputs),
+            },
+        })?;
         if head.is_in_pixels(&outputs, size) {
             return Err(OnnxError::InPixels { path: path.clone() });
         }
+        if let Some(stated) = names.as_ref().and_then(|stated| stated.first)
+            && stated != head.first_class
+        {
+            return Err(OnnxError::OtherFirstClass {
+                path: path.clone(),
+                stated,
+                family: head.family.to_string(),
+                first: head.first_class,
+            });
+        }
+        let names = names.map(|stated| stated.names);
         let labels = head
             .classes(&outputs)
             .labels(names.as_deref())
             .map_err(|classes| {
                 let classes = classes.unwrap_or_default();
                 match &names {
+                    Some(names) if is_of_model => OnnxError::NameCount {
+                        path: names_path,
+                        names: names.len(),
+                        outputs: listed(&outputs),
+                        classes,
+                    },
                     Some(names) => OnnxError::LabelCount {
                         path: names_path,
                         labels: names.len(),
@@ -322,7 +445,13 @@ impl Detect for OnnxDetector {
         let factors = self
             .config
             .normalization
-            .unwrap_or_else(|| self.head.normalization())
+            .unwrap_or_else(|| {
+                if self.network.takes_bytes() {
+                    Normalization::Raw
+                } else {
+                    self.head.normalization()
+                }
+            })
             .factors();
         let is_bgr = self.head.is_bgr();
         let convert = |[blue, green, red]: [u8; 3]| {
@@ -345,6 +474,15 @@ impl Detect for OnnxDetector {
             .fold(1.0, f32::min);
         let mut found = Vec::new();
         for candidate in self.head.decode(&outputs, input, least) {
+            let contradiction = self.head.contradiction(&candidate, input);
+            let is_background = candidate.class < self.head.first_class;
+            let zero = || "a found class is 0, the background".to_owned();
+            if let Some(what) = contradiction.or_else(|| is_background.then(zero)) {
+                return Err(DetectError::Contradiction {
+                    family: self.head.family.to_string(),
+                    what,
+                });
+            }
             let class = self
                 .classes
                 .get(candidate.class)
@@ -377,23 +515,46 @@ impl Detect for OnnxDetector {
     }
 }
 
-/// Names of the classes in their order, if available, and their file.
+/// A task of Ultralytics' models in words, unless it is to find boxes.
+fn other_task(task: &str) -> Option<String> {
+    match task {
+        "detect" => None,
+        "obb" => Some("oriented boxes".into()),
+        "segment" => Some("masks".into()),
+        "pose" => Some("key points".into()),
+        "classify" => Some("whole images".into()),
+        other => Some(format!("the task {other:?}")),
+    }
+}
+
+/// Names of the classes, if available, and their file.
 fn names(
     config: &OnnxConfig,
     network: &Network,
-) -> Result<(Option<Vec<String>>, PathBuf), OnnxError> {
+) -> Result<(Option<StatedNames>, PathBuf), OnnxError> {
     let (names, path) = match &config.labels {
         Some(path) => {
             let text = bounded_file::read_text(path).map_err(|source| OnnxError::Unreadable {
                 path: path.clone(),
                 source,
             })?;
-            (Some(labels::read(&text)), path)
+            let names = labels::read(&text);
+            (Some(StatedNames { names, first: None }), path)
         }
-        None => (network.metadata("names").map(labels::parse), &config.model),
+        None => {
+            let names = network.metadata("names").map(labels::parse).transpose();
+            let names = names.map_err(|fault| OnnxError::BadNames {
+                path: config.model.clone(),
+                fault,
+            })?;
+            (names, &config.model)
+        }
     };
     let path = path.clone();
-    match names.as_deref().and_then(labels::first_unusable) {
+    let unusable = names
+        .as_ref()
+        .and_then(|stated| labels::first_unusable(&stated.names));
+    match unusable {
         Some(label) => Err(OnnxError::BadLabel {
             label: label.to_owned(),
             path,
@@ -402,12 +563,16 @@ fn names(
     }
 }
 
-fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[NamedTensor]) -> OnnxError {
-    let outputs = outputs
+fn listed(outputs: &[NamedTensor]) -> String {
+    outputs
         .iter()
         .map(NamedTensor::to_string)
         .collect::<Vec<_>>()
-        .join("; ");
+        .join("; ")
+}
+
+fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[NamedTensor]) -> OnnxError {
+    let outputs = listed(outputs);
     let family = config.family.map_or_else(
         || "any known family".to_owned(),
         |family| family.to_string(),

@@ -116,7 +116,7 @@ impl Head {
                     (Edges::Corners, pixels)
                 };
                 let rows = values(output).chunks_exact(6);
-                rows.filter_map(|row| found((row[5] as usize, row[4]), edges, four(row)?, scale))
+                rows.filter_map(|row| found((class_of(row[5])?, row[4]), edges, four(row)?, scale))
                     .collect()
             }
             Layout::Queries { boxes, logits } => values(boxes)
@@ -135,8 +135,9 @@ impl Head {
                 .chunks_exact(4)
                 .zip(values(scores).chunks_exact(width(scores)))
                 .filter_map(|(row, scores)| {
-                    let (class, score) = best(scores.get(1..)?)?;
-                    found((class + 1, score), Edges::Corners, four(row)?, shares)
+                    let first = self.first_class;
+                    let (class, score) = best(scores.get(first..)?)?;
+                    found((class + first, score), Edges::Corners, four(row)?, shares)
                 })
                 .collect(),
             Layout::Listed {
@@ -155,12 +156,17 @@ impl Head {
                     .zip(values(classes));
                 lists
                     .filter_map(|((row, score), class)| {
-                        found((*class as usize, *score), edges, four(row)?, scale)
+                        found((class_of(*class)?, *score), edges, four(row)?, scale)
                     })
                     .collect()
             }
         }
     }
+}
+
+/// The number of a listed class; `None` for the filling of a list, such as -1.
+fn class_of(number: f32) -> Option<usize> {
+    (number >= 0.0).then_some(number as usize)
 }
 
 fn four(row: &[f32]) -> Option<[f32; 4]> {

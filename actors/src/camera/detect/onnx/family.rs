@@ -1,10 +1,12 @@
 //! Families of exported models, and how each arranges its outputs.
 
+use ecod::model::detection::BoundingBox;
 use serde::{Deserialize, Serialize};
 
 use super::labels::Classes;
 use super::letterbox::Fit;
 use super::network::NamedTensor;
+use crate::camera::detect::candidates::ScoredBox;
 use crate::camera::image_size::ImageSize;
 
 /// Family of a model, by the project that exported it.
@@ -91,6 +93,18 @@ pub(super) struct Head {
     pub(super) layout: Layout,
     /// True for TensorFlow's lists: upper, left, lower and right edge in shares of the image.
     pub(super) is_tensorflow: bool,
+    /// Number of the first class: 1 where 0 is the background.
+    pub(super) first_class: usize,
+}
+
+/// Reason for which outputs have no head.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum NoHead {
+    /// They fit no family, or another than the configured one.
+    UnknownOutputs,
+    /// They list numbers of classes, but neither their names nor the configuration state whether
+    /// the numbers begin with 0 or, after a background, with 1.
+    UnknownFirstClass,
 }
 
 /// Evidence of a network's family in addition to its outputs.
@@ -98,6 +112,8 @@ pub(super) struct Head {
 pub(super) struct Clues<'a> {
     /// The configured family.
     pub(super) told: Option<Family>,
+    /// The configured number of the first class.
+    pub(super) first_class: Option<u8>,
     /// The exporter's name of the model.
     pub(super) description: &'a str,
     pub(super) input: ImageSize,
@@ -106,21 +122,33 @@ pub(super) struct Clues<'a> {
 }
 
 impl Head {
-    /// The family and layout that the outputs fit; `None` if they fit no family, or another than
-    /// the configured one.
-    pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<Self> {
-        let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
+    /// The family and layout that the outputs fit.
+    ///
+    /// # Errors
+    /// Returns a [`NoHead`].
+    pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Result<Self, NoHead> {
+        let (family, layout) = by_names(clues, outputs)
+            .or_else(|| by_shape(clues, outputs))
+            .filter(|(family, _)| clues.told.is_none_or(|told| told == *family))
+            .ok_or(NoHead::UnknownOutputs)?;
         let is_tensorflow = outputs
             .iter()
             .any(|output| output.name.starts_with("detection_boxes"));
-        clues
-            .told
-            .is_none_or(|told| told == family)
-            .then_some(Self {
-                family,
-                layout,
-                is_tensorflow,
-            })
+        let usual = match layout {
+            Layout::Listed { boxes, .. } if family == Family::Ssd => {
+                // torchvision's names; other exporters of lists differ in the first number.
+                let is_known = is_tensorflow || outputs[boxes].name == "boxes";
+                is_known.then_some(1)
+            }
+            _ => Some(usize::from(family == Family::Ssd)),
+        };
+        let first_class = clues.first_class.map(usize::from).or(usual);
+        Ok(Self {
+            family,
+            layout,
+            is_tensorflow,
+            first_class: first_class.ok_or(NoHead::UnknownFirstClass)?,
+        })
     }
 
     /// Numbers of the classes.
@@ -137,7 +165,7 @@ impl Head {
         let has_none_last = self.family == Family::Detr;
         Classes {
             scores,
-            first: usize::from(self.family == Family::Ssd),
+            first: self.first_class,
             has_none_last,
         }
     }
@@ -154,6 +182,47 @@ impl Head {
             .values
             .chunks_exact(row)
             .any(|row| row[0] > (input.width / STRIDES[0]) as f32)
+    }
+
+    /// What a found box shows to be wrong about this head, if anything. `bounds` are in pixels of
+    /// the network's input.
+    pub(super) fn contradiction(
+        &self,
+        ScoredBox { score, bounds, .. }: &ScoredBox,
+        input: ImageSize,
+    ) -> Option<String> {
+        if *score > MAX_SCORE {
+            return Some(format!("a score is {score}, above 1"));
+        }
+        let BoundingBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        } = *bounds;
+        let are_corners = matches!(self.layout, Layout::Picked(_) | Layout::Listed { .. });
+        if are_corners && (x_min > x_max || y_min > y_max) {
+            return Some("a box ends before it begins, as centre and size would".into());
+        }
+        let are_pixels = match self.layout {
+            Layout::Objectness(_) | Layout::Columns(_) => true,
+            Layout::Picked(_) => self.family != Family::Rtdetr,
+            Layout::Listed { .. } => !self.is_tensorflow,
+            Layout::Cells(_) | Layout::Rows(_) | Layout::Queries { .. } | Layout::Priors { .. } => {
+                false
+            }
+        };
+        let (width, height) = (f64::from(input.width), f64::from(input.height));
+        let largest = x_max.max(y_max);
+        if are_pixels && largest <= MAX_SHARE && largest > 0.0 {
+            let what = "is within the first pixel, as shares of the image would be";
+            return Some(format!("a box {what}"));
+        }
+        let are_shares = !are_pixels && !matches!(self.layout, Layout::Cells(_));
+        if are_shares && (x_max > MAX_OUTSIDE * width || y_max > MAX_OUTSIDE * height) {
+            return Some("a box is far outside of the image, as pixels would be".into());
+        }
+        None
     }
 
     /// True if one object has several boxes.
@@ -196,6 +265,13 @@ impl Head {
         }
     }
 }
+
+/// Highest score of a probability, with rounding errors of 16-bit weights.
+const MAX_SCORE: f32 = 1.01;
+/// Highest coordinate of a box in shares of the image: boxes may reach over the edge.
+const MAX_SHARE: f64 = 1.5;
+/// Highest coordinate of a plausible box, in widths or heights of the image.
+const MAX_OUTSIDE: f64 = 16.0;
 
 /// Strides of the grids of YOLO.
 pub(super) const STRIDES: [u32; 3] = [8, 16, 32];

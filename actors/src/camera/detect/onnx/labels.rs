@@ -1,7 +1,10 @@
 //! Labels of a network's classes: from a file, from the model's metadata, or COCO's.
 
+use std::collections::BTreeMap;
+
 use ecod::model::names::{Label, is_label};
 
+use super::literal::{self, Literal};
 use crate::camera::detect::coco::labels as coco;
 
 /// The numbers that a network assigns to classes.
@@ -66,32 +69,84 @@ pub(super) fn read(text: &str) -> Vec<String> {
         .filter(|line| !line.is_empty())
         .map(str::to_owned)
         .collect();
-    if names
-        .first()
-        .is_some_and(|name| name.trim_matches('_').eq_ignore_ascii_case("background"))
-    {
+    if names.first().is_some_and(|name| is_background(name)) {
         names.remove(0);
     }
     names
 }
 
-/// The names in the metadata of a model, a list or map as Python or JSON writes it:
-/// `{0: 'person', 1: "car"}`.
-pub(super) fn parse(text: &str) -> Vec<String> {
-    let mut names = Vec::new();
-    let mut rest = text.chars().peekable();
-    while let Some(quote) = rest.find(|c| matches!(c, '\'' | '"')) {
-        let mut name = String::new();
-        while let Some(c) = rest.next_if(|c| *c != quote) {
-            name.extend(if c == '\\' { rest.next() } else { Some(c) });
+fn is_background(name: &str) -> bool {
+    name.trim_matches('_').eq_ignore_ascii_case("background")
+}
+
+/// The names of classes that a model states.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct StatedNames {
+    /// In the order of the classes' numbers, without a background before the others.
+    pub(super) names: Vec<String>,
+    /// Number of the first name, if the model states numbers.
+    pub(super) first: Option<usize>,
+}
+
+/// The names in the metadata of a model, a list or a map in Python's or JSON's notation, such as
+/// `{0: 'person', 1: "car"}` or `["person", "car"]`.
+///
+/// # Errors
+/// Returns the fault.
+pub(super) fn parse(text: &str) -> Result<StatedNames, String> {
+    let mut stated = match literal::parse(text)? {
+        Literal::List(names) => StatedNames {
+            names: names.into_iter().map(name_of).collect::<Result<_, _>>()?,
+            first: None,
+        },
+        Literal::Map(entries) => numbered(entries)?,
+        Literal::Text(_) | Literal::Word(_) => {
+            return Err("they are neither a list nor a map".into());
         }
-        rest.next();
-        // Keys of a map in JSON are in quotes, too.
-        if rest.peek() != Some(&':') {
-            names.push(name);
+    };
+    if stated.names.first().is_some_and(|name| is_background(name)) {
+        stated.names.remove(0);
+        stated.first = stated.first.map(|first| first + 1);
+    }
+    Ok(stated)
+}
+
+/// The names of a map from numbers to names, or from names to numbers, in the order of numbers.
+fn numbered(entries: Vec<(Literal, Literal)>) -> Result<StatedNames, String> {
+    let have_numbers = entries.iter().all(|(key, _)| key.number().is_some());
+    let mut names = BTreeMap::new();
+    for (key, value) in entries {
+        let (number, name) = if have_numbers {
+            (key, value)
+        } else {
+            (value, key)
+        };
+        let name = name_of(name)?;
+        let class = number
+            .number()
+            .ok_or_else(|| format!("{name:?} has no whole number"))?;
+        if names.insert(class, name).is_some() {
+            return Err(format!("class {class} has two names"));
         }
     }
-    names
+    let first = names.keys().next().copied();
+    let last = names.keys().next_back().copied();
+    if let Some((first, last)) = first.zip(last)
+        && let Some(class) = (first..=last).find(|class| !names.contains_key(class))
+    {
+        return Err(format!("class {class} has no name"));
+    }
+    Ok(StatedNames {
+        names: names.into_values().collect(),
+        first,
+    })
+}
+
+fn name_of(literal: Literal) -> Result<String, String> {
+    match literal {
+        Literal::Text(name) | Literal::Word(name) => Ok(name),
+        Literal::List(_) | Literal::Map(_) => Err("a name is a list or a map".into()),
+    }
 }
 
 /// The first name that cannot be a label.

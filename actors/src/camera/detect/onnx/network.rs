@@ -130,6 +130,11 @@ impl Network {
         self.size
     }
 
+    /// True if the network takes the levels of a pixel as bytes.
+    pub(super) fn takes_bytes(&self) -> bool {
+        self.is_bytes
+    }
+
     /// True if the three numbers of a pixel are adjacent, false if each channel is a plane.
     pub(super) fn has_channels_last(&self) -> bool {
         self.has_channels_last

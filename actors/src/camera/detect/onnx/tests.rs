@@ -270,13 +270,53 @@ fn a_class_without_a_label_is_an_error_of_the_frame() {
 
 #[test]
 fn names_are_read_from_files_and_metadata() {
-    assert_eq!(
-        labels::parse(r#"{0: 'person', 1: "it's", 2: 'a \'b\''}"#),
-        ["person", "it's", "a 'b'"]
-    );
-    assert_eq!(labels::parse("['a', 'b']"), ["a", "b"]);
-    assert_eq!(labels::parse(r#"{"0": "a", "1": "b"}"#), ["a", "b"]);
-    assert_eq!(labels::parse("{0: 'open"), ["open"]);
+    for (text, names, first) in [
+        (
+            r#"{0: 'person', 1: "it's", 2: 'a \'b\''}"#,
+            &["person", "it's", "a 'b'"][..],
+            Some(0),
+        ),
+        ("['a', 'b']", &["a", "b"], None),
+        ("(u'a', 'b',)", &["a", "b"], None),
+        (r#"{"0": "a", "1": "b"}"#, &["a", "b"], Some(0)),
+        ("{1: 'drone', 0: 'gate'}", &["gate", "drone"], Some(0)),
+        ("{10: 'c', 9: 'b', 8: 'a'}", &["a", "b", "c"], Some(8)),
+        (r#"{"person": 0, "car": 1}"#, &["person", "car"], Some(0)),
+        ("{0: 'background', 1: 'cat'}", &["cat"], Some(1)),
+        ("{0: 30, 1: 50,}", &["30", "50"], Some(0)),
+        (
+            r#"["gr\u00fcn", "a:b, {c}", "\ud83d\ude97", 'caf\xe9\n']"#,
+            &["gr\u{fc}n", "a:b, {c}", "\u{1f697}", "caf\u{e9}\n"],
+            None,
+        ),
+        ("{}", &[], None),
+    ] {
+        let stated = labels::parse(text).unwrap();
+        assert_eq!(
+            (&stated.names[..], stated.first),
+            (
+                &names.iter().map(ToString::to_string).collect::<Vec<_>>()[..],
+                first
+            ),
+            "{text}"
+        );
+    }
+    for (text, fault) in [
+        ("{0: 'open", "a quote is missing"),
+        ("{0: 'a', 2: 'c'}", "class 1 has no name"),
+        ("{0: 'a', 0: 'c'}", "class 0 has two names"),
+        ("person, car", "`,` follows the end"),
+        ("'person'", "neither a list nor a map"),
+        (r"['\ud83d']", "half a character"),
+        ("['a' 'b']", "`'` in place of a comma"),
+        ("{0 'a'}", "`'` in place of a colon"),
+        ("[['a']]", "a name is a list"),
+        ("", "a value is missing"),
+    ] {
+        let found = labels::parse(text).unwrap_err();
+        assert!(found.contains(fault), "{text}: {found}");
+    }
+    assert!(labels::parse(&"[".repeat(1000)).is_err());
     assert_eq!(
         labels::read("BACKGROUND\r\n aeroplane \n\nbicycle"),
         ["aeroplane", "bicycle"]
@@ -439,5 +479,173 @@ fn yolox_finds_in_photographs_what_onnx_runtime_finds_with_the_same_weights() {
                 "{name}: {same:?} at {edges:?}"
             );
         }
+    }
+}
+
+/// The bytes of a model whose metadata has other text of the same length.
+fn edited(model: &str, edits: &[(&str, &str)]) -> tempfile::NamedTempFile {
+    let mut bytes = std::fs::read(path(&format!("{model}.onnx"))).unwrap();
+    for (old, new) in edits {
+        assert_eq!(old.len(), new.len(), "lengths are in the file");
+        let places: Vec<usize> = (0..bytes.len() - old.len())
+            .filter(|at| bytes[*at..].starts_with(old.as_bytes()))
+            .collect();
+        assert!(!places.is_empty(), "{old}");
+        for at in places {
+            bytes[at..at + old.len()].copy_from_slice(new.as_bytes());
+        }
+    }
+    let file = tempfile::Builder::new().suffix(".onnx").tempfile().unwrap();
+    std::fs::write(file.path(), bytes).unwrap();
+    file
+}
+
+fn config_of(file: &tempfile::NamedTempFile) -> OnnxConfig {
+    OnnxConfig {
+        model: file.path().to_owned(),
+        ..config("yolov8")
+    }
+}
+
+const NAMES: &str = r#"{0: 'person', 1: 'traffic light', 2: 'it\'s a "car"'}"#;
+
+#[test]
+fn names_of_metadata_belong_to_their_numbers() {
+    let swapped = r#"{1: 'traffic light', 0: 'person', 2: 'it\'s a "car"'}"#;
+    let file = edited("yolov8", &[(NAMES, swapped)]);
+    let found = OnnxDetector::new(config_of(&file))
+        .unwrap()
+        .detect(&frame())
+        .unwrap();
+    let expected = &expected()["yolov8"];
+    assert_eq!(found.len(), expected.len());
+    assert!(
+        expected
+            .iter()
+            .all(|object| found.iter().any(|found| object.is(found)))
+    );
+    let from_1 = r#"{1: 'person', 2: 'traffic light', 3: 'it\'s a "car"'}"#;
+    let error = refusal(config_of(&edited("yolov8", &[(NAMES, from_1)])));
+    assert!(
+        error.contains("begin with class 1, but classes of yolov8 begin with 0: set `first_class`"),
+        "{error}"
+    );
+    let torn = r#"{0: 'person', 1: 'traffic light', 2: 'it\'s a "car" }"#;
+    let error = refusal(config_of(&edited("yolov8", &[(NAMES, torn)])));
+    assert!(
+        error.contains("a quote is missing; set `labels`"),
+        "{error}"
+    );
+    let two = r#"{0: 'person', 1: 'traffic light, 2: it\'s a "car"'  }"#;
+    let error = refusal(config_of(&edited("yolov8", &[(NAMES, two)])));
+    assert!(
+        error.contains("has 2 names in its metadata, but output0 [1, 7, 84] are for 3 classes"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_model_of_another_task_is_named() {
+    let error = refusal(config_of(&edited("yolov8", &[("detect", "posing")])));
+    assert!(
+        error.contains("the task \"posing\"") && error.contains("export a model for detection"),
+        "{error}"
+    );
+    assert_eq!(other_task("obb").unwrap(), "oriented boxes");
+    assert_eq!(other_task("detect"), None);
+}
+
+#[test]
+fn lists_of_an_unknown_exporter_need_the_number_of_the_first_class() {
+    let labels = Some(path("labels.txt"));
+    let file = edited("ssd_torchvision", &[("boxes", "b_box")]);
+    let unknown = OnnxConfig {
+        labels: labels.clone(),
+        ..config_of(&file)
+    };
+    let error = refusal(unknown.clone());
+    assert!(
+        error.contains("b_box [") && error.contains("set `first_class` to 0"),
+        "{error}"
+    );
+    let stated = OnnxConfig {
+        first_class: Some(1),
+        ..unknown.clone()
+    };
+    let found = OnnxDetector::new(stated).unwrap().detect(&frame()).unwrap();
+    assert_eq!(found.len(), expected()["ssd_torchvision"].len());
+    let shifted = OnnxConfig {
+        first_class: Some(0),
+        ..unknown
+    };
+    let mut shifted = OnnxDetector::new(shifted).unwrap();
+    assert!(shifted.detect(&frame()).is_err(), "class 3 of 0 to 2");
+    assert!(
+        OnnxConfig {
+            first_class: Some(2),
+            ..config("yolov8")
+        }
+        .validate()
+        .is_err()
+    );
+}
+
+#[test]
+fn boxes_and_scores_that_contradict_the_family_are_no_detections() {
+    let input = ImageSize {
+        width: 640,
+        height: 480,
+    };
+    let head = |family, layout, is_tensorflow| Head {
+        family,
+        layout,
+        is_tensorflow,
+        first_class: 0,
+    };
+    let listed = family::Layout::Listed {
+        boxes: 0,
+        scores: 1,
+        classes: 2,
+    };
+    let columns = head(Family::Yolov8, family::Layout::Columns(0), false);
+    let corners = head(Family::Ssd, listed, false);
+    let shares = head(Family::Ssd, listed, true);
+    let is_wrong = |head: Head, score, [x_min, y_min, x_max, y_max]: [f64; 4]| {
+        let bounds = BoundingBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        };
+        let found = ScoredBox {
+            class: 0,
+            score,
+            bounds,
+        };
+        head.contradiction(&found, input).is_some()
+    };
+    let usual = [10.0, 20.0, 300.0, 480.0];
+    for head in [columns, corners, shares] {
+        assert!(!is_wrong(head, 1.0, usual), "{head:?}");
+        assert!(is_wrong(head, 1.4, usual), "an angle in place of a score");
+    }
+    assert!(is_wrong(columns, 0.9, [0.1, 0.2, 0.4, 0.9]));
+    assert!(is_wrong(corners, 0.9, [0.1, 0.2, 0.4, 0.9]));
+    assert!(is_wrong(corners, 0.9, [300.0, 200.0, 40.0, 30.0]));
+    assert!(is_wrong(
+        shares,
+        0.9,
+        [6400.0, 9600.0, 192_000.0, 230_400.0]
+    ));
+}
+
+#[test]
+fn a_third_side_of_the_input_is_refused() {
+    let read =
+        |sides: &str| toml::from_str::<OnnxConfig>(&format!("model = 'm'\ninput_px = {sides}"));
+    assert_eq!(read("[640, 480]").unwrap().input_px, Some([640, 480]));
+    for sides in ["[640]", "[640, 480, 3]", "[3, 640, 640, 1]"] {
+        let error = read(sides).unwrap_err().to_string();
+        assert!(error.contains("expected width and height"), "{error}");
     }
 }
