@@ -2,7 +2,7 @@
 //! model.
 //!
 //! The file is JSON Lines: line n holds the detections of frame n as an array of
-//! [`ecod::model::detection::Detection`]s, which may be empty:
+//! [`ecod::model::detection::Detection`]s, which may be empty, as may be the line:
 //!
 //! ```text
 //! [{"label":"cup","confidence":0.93,"bounding_box":{"x_min":12.5,"y_min":80,"x_max":96,"y_max":171}}]
@@ -72,7 +72,9 @@ impl RecordedDetector {
             path: path.clone(),
             source,
         })?;
+        // Empty lines at the end are of editors.
         let frames = text
+            .trim_end()
             .lines()
             .enumerate()
             .map(|(index, line)| read_line(path, index + 1, line));
@@ -96,6 +98,9 @@ impl Detect for RecordedDetector {
 }
 
 fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, RecordingError> {
+    if text.trim().is_empty() {
+        return Ok(Vec::new());
+    }
     parse_detections(text).map_err(|reason| RecordingError::Malformed {
         path: path.to_owned(),
         line,
@@ -139,6 +144,8 @@ mod tests {
         let text = format!("{CUP}\n[]\n{CUP}\n");
         assert_eq!(counts(open(&text, false).unwrap(), 5), [1, 0, 1, 0, 0]);
         assert_eq!(counts(open(&text, true).unwrap(), 5), [1, 0, 1, 1, 0]);
+        let marked = format!("\u{feff}{CUP}\r\n\r\n{CUP}\r\n\r\n \n");
+        assert_eq!(counts(open(&marked, true).unwrap(), 4), [1, 0, 1, 1]);
         assert_eq!(counts(open("", true).unwrap(), 2), [0, 0]);
     }
 
