@@ -30,6 +30,7 @@ mod compact;
 mod description;
 pub(crate) mod flaw;
 mod ledger;
+mod numbers;
 mod object;
 mod region_topic;
 mod reject;
@@ -54,6 +55,7 @@ pub use description::{
 };
 pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
+pub use numbers::use_integers;
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::compact::{self, is_compact};
 use super::{
-    InvalidEntry, LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION,
+    InvalidEntry, LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION, numbers,
 };
 use crate::model::names::NodeName;
 
@@ -138,19 +138,25 @@ pub(super) fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
 fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
         Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => {
-            serde_json::from_slice(bytes).map_err(|error| {
+            serde_json::from_slice(bytes).or_else(|error| {
+                if error.is_data()
+                    && let Some(payload) = numbers::read_json(bytes)
+                {
+                    return Ok(payload);
+                }
                 // serde_json has no other way to distinguish 1e999 from a syntax error.
                 let overflow = error.to_string().starts_with("number out of range");
                 let not_finite =
                     overflow || (error.is_syntax() && is_at_non_finite_word(bytes, &error));
-                if not_finite {
+                Err(if not_finite {
                     RejectReason::NotFinite
                 } else {
                     RejectReason::Malformed
-                }
+                })
             })
         }
-        Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
+        Some(_) => ciborium::from_reader(bytes)
+            .or_else(|_| numbers::read_cbor(bytes).map_err(|(reason, ..)| reason)),
         None => Err(RejectReason::Malformed),
     }
 }
@@ -181,7 +187,7 @@ mod tests {
 
     use super::*;
     use crate::model::time::Timestamp;
-    use crate::wire::{FieldOfView, PerceivedObject, Reputations, WirePose};
+    use crate::wire::{FieldOfView, Flaw, PerceivedObject, Reputations, WirePose};
 
     fn node() -> NodeName {
         NodeName::new("euclid").unwrap()
@@ -344,6 +350,68 @@ mod tests {
             let mut report = report();
             spoil(&mut report);
             assert_eq!(reason(&report), Some(expected), "flaw {index}");
+        }
+    }
+
+    fn decoded(bytes: &[u8]) -> Result<ObjectReport, RejectReason> {
+        decode_report(bytes, &node(), &Limits::default())
+    }
+
+    /// CBOR with names, of JSON.
+    fn cbor(json: &serde_json::Value) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        ciborium::into_writer(json, &mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn numbers_are_read_in_the_forms_of_every_language() {
+        let mut expected = report();
+        expected.objects[0].x_m = 8.0;
+        expected.objects[0].confidence = 1.0;
+        expected.objects[0].covariance_m2 = Some([1.0, 0.0, 1.0]);
+        let strict: serde_json::Value =
+            serde_json::from_slice(&encode(&expected, Encoding::Json)).unwrap();
+        let mut integers = strict.clone();
+        numbers::use_integers(&mut integers);
+        assert!(integers["objects"][0]["x_m"].is_i64());
+        let mut floats = strict.clone();
+        for field in ["schema", "seq", "captured_at_us"] {
+            let number = floats[field].as_u64().unwrap();
+            floats[field] = (number as f64).into();
+        }
+        for payload in [strict, integers, floats] {
+            assert_eq!(decoded(&cbor(&payload)), Ok(expected.clone()), "{payload}");
+            let text = payload.to_string();
+            assert_eq!(decoded(text.as_bytes()), Ok(expected.clone()), "{payload}");
+        }
+        let mut compact: ciborium::Value =
+            ciborium::from_reader(&*encode(&expected, Encoding::Compact)).unwrap();
+        let captured_at = &mut compact.as_array_mut().unwrap()[3];
+        let micros = i128::from(captured_at.as_integer().unwrap());
+        *captured_at = ciborium::Value::Float(micros as f64);
+        let mut bytes = Vec::new();
+        ciborium::into_writer(&compact, &mut bytes).unwrap();
+        let written = encode(&expected, Encoding::Compact);
+        assert!(decoded(&written).is_ok());
+        assert_eq!(decoded(&bytes), decoded(&written));
+    }
+
+    #[test]
+    fn a_fault_of_a_number_names_its_field_in_json_and_cbor() {
+        let json: serde_json::Value =
+            serde_json::from_slice(&encode(&report(), Encoding::Json)).unwrap();
+        let mut half = json.clone();
+        half["seq"] = 5.5.into();
+        let mut text = json.clone();
+        text["objects"][0]["x_m"] = "8".into();
+        for (payload, field) in [(half, "seq"), (text, "objects[0].x_m")] {
+            for bytes in [cbor(&payload), payload.to_string().into_bytes()] {
+                assert_eq!(decoded(&bytes), Err(RejectReason::Malformed));
+                let flaw = Flaw::of_report(&bytes, RejectReason::Malformed, &Limits::default());
+                assert_eq!(flaw.field, field, "{flaw}");
+                assert!(flaw.fault.contains("invalid type"), "{flaw}");
+            }
         }
     }
 

@@ -18,6 +18,7 @@ use uuid::Uuid;
 pub(crate) use number::{CovarianceForm, Half, Millimetres, Single};
 
 use super::RejectReason;
+use super::numbers::compact_with_integers;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
@@ -33,8 +34,15 @@ pub(super) fn write<T: Encode<()>>(payload: &T, bytes: &mut Vec<u8>) {
     minicbor::encode(payload, bytes).expect("payloads are written into memory");
 }
 
-/// Reads a payload that fills all of `bytes`.
+/// Reads a payload that fills all of `bytes`, with numbers in any form.
 pub(super) fn read<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectReason> {
+    read_exactly(bytes).or_else(|reason| match compact_with_integers(bytes) {
+        Some(bytes) => read_exactly(&bytes),
+        None => Err(reason),
+    })
+}
+
+fn read_exactly<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectReason> {
     let mut decoder = Decoder::new(bytes);
     let payload = decoder.decode().map_err(|_| RejectReason::Malformed)?;
     if decoder.position() == bytes.len() {

@@ -8,7 +8,8 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::codec::read;
-use super::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION};
+use super::compact::is_compact;
+use super::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION, numbers};
 use crate::model::names::MAX_NAME_BYTES;
 
 /// The reason why a payload was rejected, with the responsible field.
@@ -49,7 +50,18 @@ impl Flaw {
                 Self::of_json(bytes, reason, limits).unwrap_or_else(|| Self::new(reason, "", ""))
             }
             _ => {
-                let report = read::<ObjectReport>(bytes).ok();
+                let report = match (read::<ObjectReport>(bytes), bytes.first()) {
+                    (Ok(report), _) => Some(report),
+                    (Err(_), Some(first)) if !is_compact(*first) => {
+                        return match numbers::read_cbor::<ObjectReport>(bytes) {
+                            Err((_, field, fault)) if reason == RejectReason::Malformed => {
+                                Self::new(reason, field, fault)
+                            }
+                            _ => Self::new(reason, "", ""),
+                        };
+                    }
+                    (Err(_), _) => None,
+                };
                 let invalid = report
                     .as_ref()
                     .and_then(|report| report.check_values(limits).err());
@@ -70,7 +82,10 @@ impl Flaw {
             Err(_) if reason == RejectReason::UnknownSchema => {
                 return Some(Self::of_value(&line(), reason, "schema".into()));
             }
-            Err((field, fault)) => return Some(Self::new(reason, field, fault)),
+            Err((field, fault)) => match numbers::read_json(text) {
+                Some(report) => report,
+                None => return Some(Self::new(reason, field, fault)),
+            },
         };
         let InvalidValue { field, reason } = report.check_values(limits).err()?;
         Some(Self::of_value(&line(), reason, field))
@@ -134,6 +149,20 @@ pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, 
     Ok(value)
 }
 
+/// Reads a value of JSON.
+///
+/// # Errors
+/// Returns the path of the value that cannot be read, and its fault.
+pub(super) fn read_value<T: DeserializeOwned>(value: Value) -> Result<T, (String, String)> {
+    serde_path_to_error::deserialize(value).map_err(|error| {
+        let path = error.path().to_string();
+        (
+            path.trim_matches(['.', '?']).to_owned(),
+            error.into_inner().to_string(),
+        )
+    })
+}
+
 /// The fault reported by the JSON reader.
 fn fault(text: &[u8], error: &serde_json::Error) -> String {
     let text = text
@@ -192,7 +221,7 @@ mod tests {
         );
         for (junk, told) in [
             (&b"junk"[..], "expected value, at column 1"),
-            (b"\xff\xfe", "malformed"),
+            (b"\xff\xfe", "is neither JSON nor CBOR"),
         ] {
             assert_eq!(
                 Flaw::of_report(junk, RejectReason::Malformed, &limits).to_string(),

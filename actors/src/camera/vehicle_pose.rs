@@ -6,6 +6,7 @@ use ecod::config::{ConfigError, check_range};
 use ecod::model::geometry::Pose;
 use ecod::model::origin::{GeographicPose, StatedPose};
 use ecod::model::time::Timestamp;
+use ecod::wire::use_integers;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -155,7 +156,8 @@ pub fn read_pose(
     now: Timestamp,
     wall_offset_us: i64,
 ) -> Result<(Timestamp, StatedPose), String> {
-    let fix: Value = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+    let mut fix: Value = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
+    use_integers(&mut fix);
     let time = FixTime::deserialize(&fix).map_err(|error| error.to_string())?;
     let captured_at = time
         .captured_at_us
@@ -321,6 +323,7 @@ mod tests {
         for ahead_us in [-5_000_000_i64, 0, 50_000] {
             let stamp = now.shifted(ahead_us);
             assert_eq!(read(stamp.micros().to_string()).unwrap().0, stamp);
+            assert_eq!(read(format!("{}.0", stamp.micros())).unwrap().0, stamp);
         }
         for ahead_us in [1_000_000, 3_600_000_000, i64::MAX / 2] {
             let stamp = now.shifted(ahead_us).micros().to_string();

@@ -1,0 +1,126 @@
+//! Numbers as other languages write them: `8` for `8.0`, or `5.0` for `5`.
+//!
+//! Readers of JSON and CBOR with names use this after a payload could not be read as it is.
+
+use ciborium::Value as Cbor;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Number, Value as Json};
+
+use super::RejectReason;
+use super::flaw::read_value;
+
+/// Up to this, floats represent every whole number.
+const MAX_WHOLE: f64 = 9_007_199_254_740_992.0;
+
+/// The whole number that a float represents, if it is one.
+fn whole(number: f64) -> Option<i64> {
+    (number.fract() == 0.0 && number.abs() < MAX_WHOLE).then_some(number as i64)
+}
+
+/// Replaces floats that are whole numbers by integers, which readers take for both.
+pub fn use_integers(value: &mut Json) {
+    match value {
+        Json::Number(number) if number.is_f64() => {
+            if let Some(integer) = number.as_f64().and_then(whole) {
+                *number = integer.into();
+            }
+        }
+        Json::Array(items) => items.iter_mut().for_each(use_integers),
+        Json::Object(fields) => fields.values_mut().for_each(use_integers),
+        _ => {}
+    }
+}
+
+/// Reads JSON whose numbers have any form; `None` if it cannot be read.
+pub(super) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Option<T> {
+    let mut value = serde_json::from_slice(text).ok()?;
+    use_integers(&mut value);
+    serde_json::from_value(value).ok()
+}
+
+/// Reads CBOR with names whose numbers have any form.
+///
+/// # Errors
+/// Returns the reason, the path of the value that cannot be read, and its fault.
+pub(super) fn read_cbor<T: DeserializeOwned>(
+    mut bytes: &[u8],
+) -> Result<T, (RejectReason, String, String)> {
+    let malformed = |fault: &str| (RejectReason::Malformed, String::new(), fault.to_owned());
+    let value: Cbor =
+        ciborium::from_reader(&mut bytes).map_err(|_| malformed("is neither JSON nor CBOR"))?;
+    let value = json(value).map_err(|(reason, fault)| (reason, String::new(), fault.to_owned()))?;
+    read_value(value).map_err(|(field, fault)| (RejectReason::Malformed, field, fault))
+}
+
+/// Compact CBOR with integers in place of floats that are whole numbers; `None` if it is no CBOR.
+pub(super) fn compact_with_integers(mut bytes: &[u8]) -> Option<Vec<u8>> {
+    fn replace(value: &mut Cbor) {
+        match value {
+            Cbor::Float(number) => {
+                if let Some(integer) = whole(*number) {
+                    *value = integer.into();
+                }
+            }
+            Cbor::Array(items) => items.iter_mut().for_each(replace),
+            Cbor::Map(entries) => entries.iter_mut().for_each(|(_, value)| replace(value)),
+            _ => {}
+        }
+    }
+
+    let mut value: Cbor = ciborium::from_reader(&mut bytes).ok()?;
+    if !bytes.is_empty() {
+        return None;
+    }
+    replace(&mut value);
+    let mut written = Vec::new();
+    ciborium::into_writer(&value, &mut written).ok()?;
+    Some(written)
+}
+
+/// A value of CBOR as JSON has it, with ids and hashes as text.
+fn json(value: Cbor) -> Result<Json, (RejectReason, &'static str)> {
+    let malformed = |fault| (RejectReason::Malformed, fault);
+    Ok(match value {
+        Cbor::Null => Json::Null,
+        Cbor::Bool(value) => value.into(),
+        Cbor::Text(text) => text.into(),
+        Cbor::Integer(number) => match (u64::try_from(number), i64::try_from(number)) {
+            (Ok(number), _) => number.into(),
+            (_, Ok(number)) => number.into(),
+            _ => return Err(malformed("has a number of more than 64 bits")),
+        },
+        Cbor::Float(number) => match whole(number) {
+            Some(integer) => integer.into(),
+            None => Number::from_f64(number)
+                .ok_or((RejectReason::NotFinite, "has a number that is not finite"))?
+                .into(),
+        },
+        Cbor::Bytes(bytes) => match uuid::Uuid::from_slice(&bytes) {
+            Ok(id) => id.to_string().into(),
+            Err(_) => bytes
+                .iter()
+                .map(|byte| format!("{byte:02x}"))
+                .collect::<String>()
+                .into(),
+        },
+        Cbor::Array(items) => items
+            .into_iter()
+            .map(json)
+            .collect::<Result<Vec<_>, _>>()?
+            .into(),
+        Cbor::Map(entries) => {
+            let mut fields = Map::new();
+            for (name, value) in entries {
+                let name = name
+                    .into_text()
+                    .map_err(|_| malformed("has a name that is no text"))?;
+                if fields.insert(name, json(value)?).is_some() {
+                    return Err(malformed("has a name twice"));
+                }
+            }
+            fields.into()
+        }
+        Cbor::Tag(_, value) => json(*value)?,
+        _ => return Err(malformed("has a value that JSON does not have")),
+    })
+}
