@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
+use crate::platform::bounded_file::BYTE_ORDER_MARK;
+
 /// Result of reading a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LineRead {
@@ -41,8 +43,8 @@ pub fn read_line(
     Ok(LineRead::Whole)
 }
 
-/// Some editors begin a text with it.
-const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
+/// Byte order marks of UTF-16, whose lines cannot be told from others by a byte.
+const WIDE_MARKS: [&[u8]; 2] = [b"\xff\xfe", b"\xfe\xff"];
 
 /// Opens a file to read, after a byte order mark.
 ///
@@ -65,10 +67,14 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         bail!("cannot read {}: it is a device, not a file", path.display());
     }
     let mut source = BufReader::with_capacity(1 << 18, file);
-    if source
-        .fill_buf()
-        .is_ok_and(|begin| begin.starts_with(BYTE_ORDER_MARK))
-    {
+    let begin = source.fill_buf().unwrap_or_default();
+    if WIDE_MARKS.iter().any(|mark| begin.starts_with(mark)) {
+        bail!(
+            "cannot read {}: it is text in UTF-16, save it as UTF-8",
+            path.display()
+        );
+    }
+    if begin.starts_with(BYTE_ORDER_MARK) {
         source.consume(BYTE_ORDER_MARK.len());
     }
     Ok(Box::new(source))

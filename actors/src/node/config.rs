@@ -22,8 +22,9 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::perception::landmark::{Landmark, LandmarkConfig};
 use ecod::wire::Role;
-use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
+use figment::value::{Dict, Map};
+use figment::{Figment, Metadata, Profile, Provider};
 use serde::{Deserialize, Serialize};
 
 pub use self::cells::CellEntry;
@@ -171,14 +172,37 @@ pub enum LoadError {
 /// Last line of a configuration that `init` or `join` has written.
 pub(crate) const END_OF_CONFIGURATION: &str = "# end of node.toml";
 
+/// A text in TOML, with its file for messages.
+struct TomlFile<'a> {
+    path: &'a std::path::Path,
+    text: String,
+}
+
+impl<'a> TomlFile<'a> {
+    fn read(path: &'a std::path::Path) -> Result<Self, LoadError> {
+        match bounded_file::read_text(path) {
+            Ok(text) => Ok(Self { path, text }),
+            Err(source) => Err(LoadError::Unreadable {
+                path: path.into(),
+                source,
+            }),
+        }
+    }
+}
+
+impl Provider for TomlFile<'_> {
+    fn metadata(&self) -> Metadata {
+        Metadata::from("TOML file", self.path)
+    }
+
+    fn data(&self) -> Result<Map<Profile, Dict>, figment::Error> {
+        Toml::string(&self.text).data()
+    }
+}
+
 /// Checks that a configuration is a file with content, and not truncated: `init` and `join` write
 /// an end mark.
-fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
-    let text = bounded_file::read_text(path);
-    let text = text.map_err(|source| LoadError::Unreadable {
-        path: path.into(),
-        source,
-    })?;
+fn check_whole(TomlFile { path, text }: &TomlFile<'_>) -> Result<(), LoadError> {
     let path = path.display();
     if text.trim().is_empty() {
         let remedy = "write its keys, or start the node without `--config`";
@@ -211,8 +235,9 @@ impl NodeConfig {
     pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
         let mut stated = Figment::new();
         if let Some(path) = file {
-            check_whole(path)?;
-            stated = stated.merge(Toml::file_exact(path));
+            let file = TomlFile::read(path)?;
+            check_whole(&file)?;
+            stated = stated.merge(file);
         }
         let stated = stated
             .merge(environment())
@@ -240,17 +265,13 @@ impl NodeConfig {
     /// # Errors
     /// Returns a [`LoadError`] that names the file, or the key, the value and the allowed range.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
-        let text = bounded_file::read_text(file);
-        let text = text.map_err(|source| LoadError::Unreadable {
-            path: file.into(),
-            source,
-        })?;
-        if let Ok(shared) = SharedConfig::parse(&text) {
+        let file = TomlFile::read(file)?;
+        if let Ok(shared) = SharedConfig::parse(&file.text) {
             let mut config = Self::default();
             shared.put_into(&mut config);
             return Ok(config);
         }
-        let config = Self::of_keys(&Figment::from(Toml::file_exact(file)))?;
+        let config = Self::of_keys(&Figment::from(file))?;
         config
             .fusion
             .validate()

@@ -13,7 +13,7 @@ use rustix::fs::OFlags;
 const MAX_TEXT_BYTES: u64 = 256 * 1024 * 1024;
 
 /// Some editors begin a text with it.
-const BYTE_ORDER_MARK: char = '\u{feff}';
+pub const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 
 /// Opens a regular file for reading. Opening does not block, as it would for a pipe without a
 /// writer.
@@ -56,23 +56,56 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Reads a regular file as UTF-8 text, without a byte order mark.
+/// Reads a regular file as text, without a byte order mark and with line feeds as line ends. The
+/// text is in UTF-8, or in UTF-16 with a byte order mark.
 ///
 /// # Errors
-/// Returns the errors of [`read`], or [`io::ErrorKind::InvalidData`] if the content is not UTF-8.
+/// Returns the errors of [`read`], or [`io::ErrorKind::InvalidData`] with the first line that is no
+/// such text.
 pub fn read_text(path: &Path) -> io::Result<String> {
-    let bytes = read(path, MAX_TEXT_BYTES)?;
+    let bytes = without_mark(read(path, MAX_TEXT_BYTES)?)?;
     let text = String::from_utf8(bytes).map_err(|error| {
         let place = error.utf8_error().valid_up_to();
-        io::Error::new(
-            io::ErrorKind::InvalidData,
-            format!("it is no text in UTF-8, from byte {place} on"),
-        )
+        let before = error.as_bytes().iter().take(place);
+        let line = 1 + before.filter(|byte| **byte == b'\n').count();
+        invalid(format!(
+            "it is no text in UTF-8, from line {line} (byte {place}) on: save it as UTF-8"
+        ))
     })?;
-    Ok(text
-        .strip_prefix(BYTE_ORDER_MARK)
-        .map(str::to_owned)
-        .unwrap_or(text))
+    if text.contains('\r') {
+        return Ok(text.replace("\r\n", "\n").replace('\r', "\n"));
+    }
+    Ok(text)
+}
+
+/// The bytes of a text without a byte order mark, in UTF-8 if the mark is of UTF-16. Other bytes
+/// stay, for formats that allow any between their own.
+///
+/// # Errors
+/// Returns [`io::ErrorKind::InvalidData`] if the mark is of UTF-16, but the text is not.
+pub fn without_mark(mut bytes: Vec<u8>) -> io::Result<Vec<u8>> {
+    let (text, unit): (_, fn([u8; 2]) -> u16) = match bytes.as_slice() {
+        [0xff, 0xfe, text @ ..] => (text, u16::from_le_bytes),
+        [0xfe, 0xff, text @ ..] => (text, u16::from_be_bytes),
+        _ => {
+            if bytes.starts_with(BYTE_ORDER_MARK) {
+                bytes.drain(..BYTE_ORDER_MARK.len());
+            }
+            return Ok(bytes);
+        }
+    };
+    let (pairs, rest) = text.as_chunks::<2>();
+    let units: Vec<u16> = pairs.iter().copied().map(unit).collect();
+    match String::from_utf16(&units) {
+        Ok(text) if rest.is_empty() => Ok(text.into_bytes()),
+        _ => Err(invalid(
+            "it begins as text in UTF-16, but is none: save it as UTF-8".into(),
+        )),
+    }
+}
+
+fn invalid(fault: String) -> io::Error {
+    io::Error::new(io::ErrorKind::InvalidData, fault)
 }
 
 #[cfg(test)]
@@ -126,6 +159,37 @@ mod tests {
         );
         std::fs::write(&path, b"car\n\xff").unwrap();
         let error = read_text(&path).unwrap_err().to_string();
-        assert!(error.contains("from byte 4 on"), "{error}");
+        assert!(error.contains("from line 2 (byte 4) on"), "{error}");
+    }
+
+    #[test]
+    fn a_text_is_the_same_in_the_encodings_and_with_the_line_ends_of_every_system() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("labels.txt");
+        let text = "car\nF\u{fc}\u{df}e \u{1f697}\n\nlast";
+        for ends in ["\n", "\r\n", "\r"] {
+            let text = text.replace('\n', ends);
+            let marked = format!("\u{feff}{text}");
+            let units = |of: fn(u16) -> [u8; 2]| marked.encode_utf16().flat_map(of).collect();
+            let encoded: [Vec<u8>; 4] = [
+                text.clone().into(),
+                marked.clone().into(),
+                units(u16::to_le_bytes),
+                units(u16::to_be_bytes),
+            ];
+            for bytes in encoded {
+                std::fs::write(&path, &bytes).unwrap();
+                assert_eq!(
+                    read_text(&path).unwrap().lines().collect::<Vec<_>>(),
+                    ["car", "F\u{fc}\u{df}e \u{1f697}", "", "last"],
+                    "{bytes:?}"
+                );
+            }
+        }
+        for half in [&b"\xff\xfea"[..], b"\xff\xfe\x00\xd8"] {
+            std::fs::write(&path, half).unwrap();
+            let error = read_text(&path).unwrap_err().to_string();
+            assert!(error.contains("save it as UTF-8"), "{error}");
+        }
     }
 }

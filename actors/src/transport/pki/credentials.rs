@@ -409,7 +409,9 @@ fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, Credentia
 }
 
 fn bytes(key: &'static str, path: &Path) -> Result<Vec<u8>, CredentialsError> {
-    bounded_file::read(path, MAX_PEM_BYTES).map_err(|error| file_error(key, path, &error))
+    bounded_file::read(path, MAX_PEM_BYTES)
+        .and_then(bounded_file::without_mark)
+        .map_err(|error| file_error(key, path, &error))
 }
 
 fn file_error(
