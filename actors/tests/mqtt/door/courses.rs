@@ -7,6 +7,9 @@ use ecod::aggregator::Algorithms;
 use ecod::leadership::Position;
 use ecod::model::names::NodeName;
 use ecod::wire::{NodeState, NodeStatus, Reputation, Reputations, Role, Verdicts};
+use rumqttc::v5::mqttbytes::QoS;
+use rumqttc::v5::mqttbytes::v5::LastWill;
+use rumqttc::v5::{AsyncClient, MqttOptions};
 use tokio::time::{sleep, timeout};
 
 use crate::door::cell::{Cell, PATIENCE, Program};
@@ -200,6 +203,35 @@ async fn a_vehicle_without_a_node_may_be_there_before_the_leader() {
         answer.1
     );
     reported(&cell, &euclid, "euclid--yolo", "edge", 3.1, "euclid").await;
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_vehicle_without_a_node_may_have_its_status_as_last_will() {
+    let mut cell = Cell::new();
+    cell.start("edge", Role::Edge, |_| ()).await;
+    cell.served_by("edge").await;
+    let watcher = cell.program("watcher", "edge", &["nodes/+"]).await;
+    let door = cell.door("edge");
+    let status = r#"{"schema":1,"node":"euclid","id":"01a1fca2-b074-775a-88b5-e92725a307f1","role":"cav","state":"offline","epoch":0,"version":"9"}"#;
+    let login = async |name: &str, topic: &str| {
+        let mut options = MqttOptions::new(name, door.ip().to_string(), door.port());
+        let topic = format!("ecod/v1/lot/{topic}");
+        options.set_last_will(LastWill::new(topic, status, QoS::AtLeastOnce, true, None));
+        let (_client, mut events) = AsyncClient::new(options, 4);
+        // The connection ends here without a farewell.
+        events.poll().await.is_ok()
+    };
+    assert!(login("euclid", "nodes/euclid").await);
+    for topic in ["nodes/edge", "global_detections", "detections/edge"] {
+        assert!(!login("gauss", topic).await, "{topic}");
+    }
+    let told = async {
+        while watcher.heard_on("nodes/euclid").is_empty() {
+            sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, told).await.unwrap();
     cell.stop().await;
 }
 

@@ -102,9 +102,13 @@ impl Door {
         principal: &Principal,
         topic: &str,
     ) -> bool {
+        let is_of_nodeless = |door: &DoorState| match door.setup.topics.parse(topic) {
+            Some(Topic::Nodes(name)) => door.is_nodeless_name(principal, &name),
+            _ => false,
+        };
         self.0
             .as_deref()
-            .is_some_and(|door| door.may_say(principal, topic).is_ok())
+            .is_some_and(|door| is_of_nodeless(door) || door.may_say(principal, topic).is_ok())
     }
 
     /// Processes a program's message.
