@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use ecod::model::names::NodeName;
-use ecod_lab::eval::formats::FileFormat;
+use ecod_lab::eval::formats::{FileContext, FileFormat};
 
 use super::{Recording, write_reports};
 
@@ -53,8 +53,8 @@ pub(super) fn convert(
         fs::write(own_detections.join(&file), merged)?;
     }
     let (truth, detections) = (
-        FileFormat::Kitti.read(&own_truth, None)?,
-        FileFormat::Kitti.read(&own_detections, None)?,
+        FileFormat::Kitti.read(&own_truth, FileContext::default())?,
+        FileFormat::Kitti.read(&own_detections, FileContext::default())?,
     );
     let mut reports = Vec::new();
     for (number, (truth, detections)) in truth.iter().zip(&detections).enumerate() {

@@ -300,7 +300,7 @@ impl TrackEvaluation {
         }
     }
 
-    /// The classes of the reported objects and those of the truth, if both have some and none in
+    /// The classes of the reported objects and of the truth, if both have some, but not one in
     /// common.
     pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
         let said = self.maps.iter().flatten().flat_map(|(_, said)| said);

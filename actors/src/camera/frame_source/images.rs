@@ -95,13 +95,14 @@ pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
 /// `None` unless the name has one place for the number.
 fn numbered(path: &Path, name: &str) -> Option<Vec<PathBuf>> {
     let mut places = name.match_indices('%').filter_map(|(at, _)| {
-        let (digits, after) = name[at + 1..].split_once('d')?;
+        let (before, rest) = name.split_at(at);
+        let (digits, after) = rest.strip_prefix('%')?.split_once('d')?;
         let width: usize = if digits.is_empty() {
             0
         } else {
             digits.parse().ok()?
         };
-        (width <= MAX_DIGITS).then_some((&name[..at], width, after))
+        (width <= MAX_DIGITS).then_some((before, width, after))
     });
     let (before, width, after) = places.next().filter(|_| places.next().is_none())?;
     let file = |number: u64| path.with_file_name(format!("{before}{number:0width$}{after}"));

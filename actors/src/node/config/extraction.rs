@@ -22,7 +22,7 @@ pub(super) fn environment() -> Env {
         .split("__")
 }
 
-/// Variables that begin like a key's, but belong to none.
+/// Variables with the prefix of keys that name no key.
 pub(crate) fn variables_without_key() -> Vec<String> {
     let names = std::env::vars_os().filter_map(|(name, _)| name.into_string().ok());
     let is_unknown = |name: &String| {

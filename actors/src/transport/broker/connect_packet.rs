@@ -29,7 +29,7 @@ const MQTT_5: u8 = 5;
 const LEVELS: RangeInclusive<u8> = 3..=MQTT_5;
 
 /// CONNACK with the return code "unacceptable protocol version" (MQTT 3.1.1, 3.2.2.3). A bridge of
-/// mosquitto, which first asks with the level 0x84, then asks with 4.
+/// mosquitto first sends level 0x84, and after this answer 4.
 pub(super) const UNKNOWN_VERSION: [u8; 4] = [0x20, 2, 0, 1];
 
 /// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first

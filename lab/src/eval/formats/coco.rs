@@ -1,7 +1,7 @@
 //! COCO (Lin et al., arXiv 1405.0312): a dataset with annotations, or the results of a detector.
 //!
 //! A dataset has `images`, `categories` and `annotations`; results are a list of entries in place
-//! of the annotations, with scores, and their categories are those of the truth or COCO's own. Crowds are left out. An
+//! of the annotations, with scores, and their categories are the truth's or COCO's own. Crowds are left out. An
 //! identity is a `track_id` or `instance_id`, as in extensions for videos.
 
 use anyhow::{Context, bail};
@@ -106,7 +106,7 @@ pub(super) fn frames(
     Ok(file)
 }
 
-/// The categories of a dataset; none of results.
+/// The categories of a dataset; results state no names.
 pub(super) fn categories(text: &str) -> anyhow::Result<Categories> {
     #[derive(Deserialize)]
     struct CategoriesOnly {

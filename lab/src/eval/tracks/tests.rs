@@ -312,3 +312,24 @@ fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
     assert_eq!((at.matches, at.misses), (5, 1), "{scores:?}");
     near(at.motp_m, (0.5 + 0.5) / 5.0);
 }
+
+#[test]
+fn classes_that_never_meet_are_listed() {
+    let text = r#"{"frames": [{"t_us": 100, "objects": [{"id": 1, "label": "car", "x_m": 1, "y_m": 2}]}]}"#;
+    let with = |labels: &[&str]| {
+        let mut evaluation = TrackEvaluation::new(TrackTruth::parse(text).unwrap());
+        let objects: Vec<SaidObject> = labels
+            .iter()
+            .map(|label| SaidObject {
+                label: Label::new(label),
+                ..said(0, 1.0, 0.9)
+            })
+            .collect();
+        evaluation.said(Timestamp(100), &objects);
+        evaluation.labels_that_never_meet()
+    };
+    assert_eq!(with(&["person", "car"]), None);
+    assert_eq!(with(&[]), None);
+    let apart = (r#""Car", "person""#.to_owned(), r#""car""#.to_owned());
+    assert_eq!(with(&["person", "Car"]), Some(apart));
+}
