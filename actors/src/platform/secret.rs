@@ -65,30 +65,21 @@ pub fn without_logins(text: &str) -> String {
 fn line_without_logins(line: &str) -> String {
     let mut shown = String::new();
     let mut rest = line;
-    while let Some(at) = rest.find(SCHEME_END) {
-        let (before, address) = rest.split_at(at + SCHEME_END.len());
+    while let Some((before, address)) = rest.split_once(SCHEME_END) {
         shown.push_str(before);
-        let scheme = before[..at]
-            .rfind(|c: char| !(c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.')));
-        let quote = scheme
-            .and_then(|at| before[at..].chars().next())
-            .filter(|c| matches!(c, '"' | '\'' | '`'));
-        let end = match quote {
-            Some(quote) => address.find(quote),
-            None => address.find(char::is_whitespace),
+        shown.push_str(SCHEME_END);
+        let is_of_scheme = |c: char| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.');
+        let begin = before.trim_end_matches(is_of_scheme).chars().next_back();
+        let token = match begin.filter(|c| matches!(c, '"' | '\'' | '`')) {
+            Some(quote) => address.split(quote).next(),
+            None => address
+                .split(char::is_whitespace)
+                .next()
+                // Punctuation of the sentence around the address.
+                .map(|token| token.trim_end_matches([':', ';', ',', '.', ')', '"', '\''])),
         };
-        let address_end = match quote {
-            Some(_) => end.unwrap_or(address.len()),
-            // Punctuation of the sentence around the address.
-            None => address[..end.unwrap_or(address.len())]
-                .trim_end_matches([':', ';', ',', '.', ')', '"', '\''])
-                .len(),
-        };
-        let (address, after) = address.split_at(address_end);
-        match bare_address(address) {
-            Some(bare) => shown.push_str(bare),
-            None => shown.push_str(HIDDEN),
-        }
+        let (address, after) = address.split_at(token.map_or(address.len(), str::len));
+        shown.push_str(bare_address(address).unwrap_or(HIDDEN));
         // A login may go on behind a blank or a quote.
         let goes_on = !address.contains('@') || after.contains('@');
         rest = if goes_on && may_be_half_a_login(address) {
@@ -106,19 +97,19 @@ const SCHEME_END: &str = "://";
 /// login ends.
 pub(crate) fn bare_address(address: &str) -> Option<&str> {
     let is_end = |c: char| matches!(c, '/' | '?' | '#' | '"' | '\'' | '\\') || c.is_whitespace();
-    let authority = &address[..address.find(is_end).unwrap_or(address.len())];
+    let authority = address.split(is_end).next().unwrap_or(address);
     let login = authority.rfind('@').map_or(0, |at| at + 1);
-    let bare = &address[login..];
+    let (_, bare) = address.split_at(login);
     if bare.contains('@') || may_be_half_a_login(bare) {
         return None;
     }
-    Some(&bare[..bare.find('?').unwrap_or(bare.len())])
+    bare.split('?').next()
 }
 
 /// True if an address without `@` begins with `name:`, but not with a port behind it.
 fn may_be_half_a_login(address: &str) -> bool {
     let is_end = |c: char| matches!(c, '/' | '?' | '#') || c.is_whitespace();
-    let authority = &address[..address.find(is_end).unwrap_or(address.len())];
+    let authority = address.split(is_end).next().unwrap_or(address);
     if authority.contains('@') || authority.starts_with('[') {
         return false;
     }
