@@ -202,6 +202,11 @@ impl Evaluation {
         }
     }
 
+    /// True if a line so far is on a location of the truth at its time.
+    pub fn meets_truth(&self) -> bool {
+        self.pace.rounds.entries + self.vote.rounds.entries > 0
+    }
+
     /// Counts one report's votes, at the time of its capture.
     pub fn report(&mut self, kind: ReportKind, report: &ObjectReport) {
         let (votes, synonyms) = match kind {

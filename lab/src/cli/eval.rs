@@ -111,6 +111,13 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
         );
     }
     read_output(&arguments.input, |line| evaluation.fused(&line))?;
+    if !evaluation.meets_truth() {
+        eprintln!(
+            "no location of {} is in {} at the time of a line; locations count by their exact ids",
+            arguments.input.display(),
+            path.display()
+        );
+    }
     if let Some(reports) = &arguments.reports {
         read_reports(&mut evaluation, reports, &config)?;
     }

@@ -192,3 +192,13 @@ fn votes_are_translated_by_the_cells_synonyms_without_known_locations_too() {
         "PACE knows no synonyms"
     );
 }
+
+#[test]
+fn locations_that_never_meet_are_told_from_those_that_do() {
+    let truth = || Truth::parse(r#"{"landmarks": {"a": "cup"}}"#).unwrap();
+    for (id, meets) in [("a", true), ("A", false)] {
+        let mut evaluation = Evaluation::new(truth());
+        evaluation.fused(&verdicts(1, &[(id, Some("cup"))]));
+        assert_eq!(evaluation.meets_truth(), meets, "{id}");
+    }
+}
