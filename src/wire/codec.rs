@@ -156,7 +156,7 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
             })
         }
         Some(_) => ciborium::from_reader(bytes)
-            .or_else(|_| numbers::read_cbor(bytes).map_err(|(reason, ..)| reason)),
+            .or_else(|_| numbers::read_cbor(bytes).map_err(|unreadable| unreadable.reason)),
         None => Err(RejectReason::Malformed),
     }
 }

@@ -54,8 +54,8 @@ impl Flaw {
                     (Ok(report), _) => Some(report),
                     (Err(_), Some(first)) if !is_compact(*first) => {
                         return match numbers::read_cbor::<ObjectReport>(bytes) {
-                            Err((_, field, fault)) if reason == RejectReason::Malformed => {
-                                Self::new(reason, field, fault)
+                            Err(unreadable) if reason == RejectReason::Malformed => {
+                                Self::new(reason, unreadable.field, unreadable.fault)
                             }
                             _ => Self::new(reason, "", ""),
                         };
@@ -147,20 +147,6 @@ pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, 
         .end()
         .map_err(|error| (String::new(), fault(text, &error)))?;
     Ok(value)
-}
-
-/// Reads a value of JSON.
-///
-/// # Errors
-/// Returns the path of the value that cannot be read, and its fault.
-pub(super) fn read_value<T: DeserializeOwned>(value: Value) -> Result<T, (String, String)> {
-    serde_path_to_error::deserialize(value).map_err(|error| {
-        let path = error.path().to_string();
-        (
-            path.trim_matches(['.', '?']).to_owned(),
-            error.into_inner().to_string(),
-        )
-    })
 }
 
 /// The fault reported by the JSON reader.

@@ -7,7 +7,6 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Number, Value as Json};
 
 use super::RejectReason;
-use super::flaw::read_value;
 
 /// Up to this, floats represent every whole number.
 const MAX_WHOLE: f64 = 9_007_199_254_740_992.0;
@@ -38,18 +37,43 @@ pub(super) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Option<T> {
     serde_json::from_value(value).ok()
 }
 
+/// Why a payload of CBOR cannot be read.
+pub(super) struct Unreadable {
+    pub(super) reason: RejectReason,
+    /// Path of the value that cannot be read; empty for the whole payload.
+    pub(super) field: String,
+    pub(super) fault: String,
+}
+
+impl Unreadable {
+    fn new(reason: RejectReason, fault: &str) -> Self {
+        Self {
+            reason,
+            field: String::new(),
+            fault: fault.to_owned(),
+        }
+    }
+
+    fn malformed(fault: &str) -> Self {
+        Self::new(RejectReason::Malformed, fault)
+    }
+}
+
 /// Reads CBOR with names whose numbers have any form.
 ///
 /// # Errors
-/// Returns the reason, the path of the value that cannot be read, and its fault.
-pub(super) fn read_cbor<T: DeserializeOwned>(
-    mut bytes: &[u8],
-) -> Result<T, (RejectReason, String, String)> {
-    let malformed = |fault: &str| (RejectReason::Malformed, String::new(), fault.to_owned());
-    let value: Cbor =
-        ciborium::from_reader(&mut bytes).map_err(|_| malformed("is neither JSON nor CBOR"))?;
-    let value = json(value).map_err(|(reason, fault)| (reason, String::new(), fault.to_owned()))?;
-    read_value(value).map_err(|(field, fault)| (RejectReason::Malformed, field, fault))
+/// Returns the value that cannot be read.
+pub(super) fn read_cbor<T: DeserializeOwned>(mut bytes: &[u8]) -> Result<T, Unreadable> {
+    let value: Cbor = ciborium::from_reader(&mut bytes)
+        .map_err(|_| Unreadable::malformed("is neither JSON nor CBOR"))?;
+    serde_path_to_error::deserialize(json(value)?).map_err(|error| {
+        let path = error.path().to_string();
+        Unreadable {
+            reason: RejectReason::Malformed,
+            field: path.trim_matches(['.', '?']).to_owned(),
+            fault: error.into_inner().to_string(),
+        }
+    })
 }
 
 /// Compact CBOR with integers in place of floats that are whole numbers; `None` if it is no CBOR.
@@ -78,8 +102,8 @@ pub(super) fn compact_with_integers(mut bytes: &[u8]) -> Option<Vec<u8>> {
 }
 
 /// A value of CBOR as JSON has it, with ids and hashes as text.
-fn json(value: Cbor) -> Result<Json, (RejectReason, &'static str)> {
-    let malformed = |fault| (RejectReason::Malformed, fault);
+fn json(value: Cbor) -> Result<Json, Unreadable> {
+    let malformed = Unreadable::malformed;
     Ok(match value {
         Cbor::Null => Json::Null,
         Cbor::Bool(value) => value.into(),
@@ -92,7 +116,9 @@ fn json(value: Cbor) -> Result<Json, (RejectReason, &'static str)> {
         Cbor::Float(number) => match whole(number) {
             Some(integer) => integer.into(),
             None => Number::from_f64(number)
-                .ok_or((RejectReason::NotFinite, "has a number that is not finite"))?
+                .ok_or_else(|| {
+                    Unreadable::new(RejectReason::NotFinite, "has a number that is not finite")
+                })?
                 .into(),
         },
         Cbor::Bytes(bytes) => match uuid::Uuid::from_slice(&bytes) {
