@@ -38,11 +38,6 @@ impl LandmarkTable {
         rest.next().map(|(_, index)| *index)
     }
 
-    /// Number of indices that are or were in use.
-    pub(super) fn end(&self) -> usize {
-        self.entries.len()
-    }
-
     /// The index of a landmark.
     pub(super) fn index(&self, id: &LandmarkId) -> Option<usize> {
         self.indices.get(id).copied()

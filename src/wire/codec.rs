@@ -398,6 +398,14 @@ mod tests {
     }
 
     #[test]
+    fn a_field_that_occurs_twice_is_refused_whatever_the_form_of_numbers() {
+        let text = String::from_utf8(encode(&report(), Encoding::Json)).unwrap();
+        let twice = text.replacen("\"seq\":", "\"seq\":5.0,\"seq\":", 1);
+        assert_ne!(twice, text);
+        assert_eq!(decoded(twice.as_bytes()), Err(RejectReason::Malformed));
+    }
+
+    #[test]
     fn a_fault_of_a_number_names_its_field_in_json_and_cbor() {
         let json: serde_json::Value =
             serde_json::from_slice(&encode(&report(), Encoding::Json)).unwrap();

@@ -1,6 +1,6 @@
 //! Numbers as other languages write them: `8` for `8.0`, or `5.0` for `5`.
 //!
-//! Readers of JSON and CBOR with names use this after a payload could not be read as it is.
+//! Readers of payloads use this after a payload could not be read as it is.
 
 use ciborium::Value as Cbor;
 use serde::de::DeserializeOwned;
@@ -32,9 +32,9 @@ pub fn use_integers(value: &mut Json) {
 
 /// Reads JSON whose numbers have any form; `None` if it cannot be read.
 pub(super) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Option<T> {
-    let mut value = serde_json::from_slice(text).ok()?;
-    use_integers(&mut value);
-    serde_json::from_value(value).ok()
+    // Maps of CBOR keep a name that occurs twice, so that it is refused.
+    let value: Cbor = serde_json::from_slice(text).ok()?;
+    serde_json::from_value(json(value).ok()?).ok()
 }
 
 /// Why a payload of CBOR cannot be read.

@@ -269,7 +269,7 @@ impl Calibration {
         let count = self.distortion.len();
         if !COEFFICIENT_COUNTS.contains(&count) {
             return Err(format!(
-                "`distortion` has {count} coefficients, must have 4, 5 or 8: k1, k2, p1, p2, k3, k4, k5, k6; calibrate again without further ones, and fisheye lenses not at all"
+                "`distortion` has {count} coefficients, must have 4, 5 or 8: k1, k2, p1, p2, k3, k4, k5, k6; fisheye calibrations are not supported"
             ));
         }
         let sides = [

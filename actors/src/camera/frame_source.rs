@@ -185,7 +185,7 @@ impl SourceConfig {
                 }
                 // Without a scheme the address is refused, but its secret must not be shown with
                 // the error.
-                None => url.rsplit('@').next().unwrap_or_default().to_owned(),
+                None => bare_address(url).unwrap_or(HIDDEN).to_owned(),
             },
         }
     }

@@ -312,9 +312,11 @@ fn read_token(argument: &str) -> anyhow::Result<Token> {
         return Ok(argument.parse()?);
     }
     let mut input = std::io::stdin().lock().take(MAX_TOKEN_BYTES);
-    let mut text = String::new();
-    // A person who pastes a token does not end the input.
-    while input.read_line(&mut text)? > 0 {
+    let (mut text, mut line) = (String::new(), String::new());
+    // A person who pastes a token does not end the input, but may send an empty line.
+    while input.read_line(&mut line)? > 0 && !line.trim().is_empty() {
+        text += &line;
+        line.clear();
         if let Ok(token) = text.parse() {
             return Ok(token);
         }

@@ -66,16 +66,21 @@ pub fn read_text(path: &Path) -> io::Result<String> {
     let bytes = without_mark(read(path, MAX_TEXT_BYTES)?)?;
     let text = String::from_utf8(bytes).map_err(|error| {
         let place = error.utf8_error().valid_up_to();
-        let before = error.as_bytes().iter().take(place);
-        let line = 1 + before.filter(|byte| **byte == b'\n').count();
+        let before = String::from_utf8_lossy(error.as_bytes().get(..place).unwrap_or_default());
+        let line = 1 + unix_lines(&before).matches('\n').count();
         invalid(format!(
             "it is no text in UTF-8, from line {line} (byte {place}) on: save it as UTF-8"
         ))
     })?;
     if text.contains('\r') {
-        return Ok(text.replace("\r\n", "\n").replace('\r', "\n"));
+        return Ok(unix_lines(&text));
     }
     Ok(text)
+}
+
+/// A text with the line ends of Unix.
+fn unix_lines(text: &str) -> String {
+    text.replace("\r\n", "\n").replace('\r', "\n")
 }
 
 /// The bytes of a text without a byte order mark, in UTF-8 if the mark is of UTF-16. Other bytes

@@ -70,7 +70,8 @@ fn line_without_logins(line: &str) -> String {
         shown.push_str(SCHEME_END);
         let is_of_scheme = |c: char| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.');
         let begin = before.trim_end_matches(is_of_scheme).chars().next_back();
-        let token = match begin.filter(|c| matches!(c, '"' | '\'' | '`')) {
+        let quote = begin.filter(|c| matches!(c, '"' | '\'' | '`'));
+        let token = match quote {
             Some(quote) => address.split(quote).next(),
             None => address
                 .split(char::is_whitespace)
@@ -79,14 +80,20 @@ fn line_without_logins(line: &str) -> String {
                 .map(|token| token.trim_end_matches([':', ';', ',', '.', ')', '"', '\''])),
         };
         let (address, after) = address.split_at(token.map_or(address.len(), str::len));
-        shown.push_str(bare_address(address).unwrap_or(HIDDEN));
         // A login may go on behind a blank or a quote.
-        let goes_on = !address.contains('@') || after.contains('@');
-        rest = if goes_on && may_be_half_a_login(address) {
-            ""
+        let before_next = after.split(SCHEME_END).next().unwrap_or(after);
+        let is_half = if quote.is_none() {
+            before_next.contains('@') || (!address.contains('@') && may_be_half_a_login(address))
         } else {
-            after
+            (!address.contains('@') || before_next.contains('@')) && may_be_half_a_login(address)
         };
+        if is_half {
+            shown.push_str(HIDDEN);
+            rest = "";
+        } else {
+            shown.push_str(bare_address(address).unwrap_or(HIDDEN));
+            rest = after;
+        }
     }
     shown + rest
 }
@@ -148,6 +155,12 @@ mod tests {
             ),
             ("'rtsp://admin:ge'heim1@camera'", "'rtsp://***"),
             ("rtsp://admin:ge\"heim1@camera/1", "rtsp://***"),
+            ("rtsp://admin:p@ss wort@camera/1", "rtsp://***"),
+            ("rtsp://admin:12 34@camera/1", "rtsp://***"),
+            (
+                "rtsp://u:p@one ! mix rtsp://u:p@two ! appsink",
+                "rtsp://one ! mix rtsp://two ! appsink",
+            ),
             (
                 "first\nmqtt://u:geheim1@broker:1883\nlast",
                 "first\nmqtt://broker:1883\nlast",

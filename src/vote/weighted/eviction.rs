@@ -33,9 +33,9 @@ impl WeightedVoting {
     }
 
     fn landmarks_where(&self, is_affected: impl Fn(&LandmarkVotes) -> bool) -> Vec<usize> {
-        (0..self.landmarks.end())
-            .filter(|landmark| is_affected(self.landmarks.votes(*landmark)))
-            .collect()
+        let mut landmarks = self.landmarks.by_name();
+        landmarks.retain(|landmark| is_affected(self.landmarks.votes(*landmark)));
+        landmarks
     }
 
     /// The index of a label; `stated` is the vehicle that stated it and the time.

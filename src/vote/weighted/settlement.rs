@@ -21,10 +21,16 @@ impl WeightedVoting {
     /// Removes the votes that are stale at `now`.
     pub(super) fn expire(&mut self, now: Timestamp) {
         let freshness = self.freshness();
-        while self.expiries.first().is_some_and(|(due, _)| *due <= now) {
-            let Some((_, landmark)) = self.expiries.pop_first() else {
-                break;
-            };
+        let mut due = Vec::new();
+        while let Some(&(at, landmark)) = self.expiries.first()
+            && at <= now
+        {
+            self.expiries.pop_first();
+            due.push((at, landmark));
+        }
+        // By name and not by index, which depends on the order of arrival.
+        due.sort_by_key(|&(at, landmark)| (at, self.landmarks.id(landmark).clone()));
+        for (_, landmark) in due {
             self.remove_votes(landmark, |vote| vote.at + freshness <= now);
             self.schedule_expiry(landmark);
         }

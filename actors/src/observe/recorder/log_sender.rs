@@ -68,8 +68,8 @@ pub struct CapturedPicture {
     pub captured_at: Timestamp,
     /// Height of the picture in pixels.
     pub height: u32,
-    /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for
-    /// another shape.
+    /// Optics for pixels of the picture, and OpenCV's coefficients k1, k2, p1, p2, k3 to k6; absent
+    /// where they are for another shape.
     pub optics: Option<(Intrinsics, Option<[f64; 8]>)>,
     /// Detections in pixels of the picture, before distortion is removed.
     pub detections: Vec<Detection>,

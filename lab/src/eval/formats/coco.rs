@@ -171,7 +171,8 @@ fn object(
     }
     let object = ParsedObject {
         entry: place,
-        id: track_id,
+        // −1 says that a box has no identity.
+        id: track_id.filter(|id| *id >= 0),
         label,
         score,
         place: FilePlace::Image(image),

@@ -24,7 +24,7 @@ use ecod::wire::{CellDescription, Flaw, RejectReason, ReportKind, Topic, decode,
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
-use rmqtt::types::Publish;
+use rmqtt::types::{FromType, Publish};
 
 use super::refusals::RefusalReason;
 use super::{
@@ -431,7 +431,7 @@ impl Handler for DoorHooks {
                     TopicPlace::Door.topic(&subscribe.topic_filter).into(),
                 ))),
             ),
-            Parameter::MessagePublish(Some(session), _, publish) => {
+            Parameter::MessagePublish(Some(session), from, publish) => {
                 let Some(principal) = self.program(session) else {
                     return (true, before);
                 };
@@ -441,6 +441,16 @@ impl Handler for DoorHooks {
                 };
                 let place = self.door.place_of(&principal, &publish.topic);
                 moved.topic = place.topic(&publish.topic).into();
+                // rmqtt asks for the right to publish a message, but not for that of a last will.
+                if let FromType::LastWill = from.typ()
+                    && let Err(refusal) =
+                        self.door.take(&principal, (place, &publish.topic), publish)
+                {
+                    let client = &session.id.client_id;
+                    self.door.note_refusal(client, &publish.topic, &refusal);
+                    moved.topic = TopicPlace::Inbound.topic(&publish.topic).into();
+                    moved.retain = false;
+                }
                 (true, Some(HookResult::Publish(moved)))
             }
             Parameter::MessageDelivered(_, _, publish) => {
