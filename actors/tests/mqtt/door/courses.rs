@@ -254,6 +254,28 @@ async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
         reason == "NotAuthorized" && text.contains("256 vehicles without a node"),
         "{reason} {text}"
     );
+    let watcher = cell.program("watcher", "edge", &["nodes/+"]).await;
+    let door = cell.door("edge");
+    for name in ["x999", "x7"] {
+        let mut options = MqttOptions::new(name, door.ip().to_string(), door.port());
+        let topic = format!("ecod/v1/lot/nodes/{name}");
+        let status = format!(
+            r#"{{"schema":1,"node":"{name}","id":"01a1fca2-b074-775a-88b5-e92725a307f1","role":"cav","state":"offline","epoch":0,"version":"9"}}"#
+        );
+        options.set_last_will(LastWill::new(topic, status, QoS::AtLeastOnce, true, None));
+        let (_client, mut events) = AsyncClient::new(options, 4);
+        assert!(events.poll().await.is_ok(), "{name}");
+    }
+    let told = async {
+        while watcher.heard_on("nodes/x7").is_empty() {
+            sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, told).await.unwrap();
+    assert!(
+        watcher.heard_on("nodes/x999").is_empty(),
+        "a last will beyond the room"
+    );
     assert_eq!(status(7, "hello again").await.0, "Success", "its own place");
     assert_eq!(status(8, "").await.0, "Success", "it gives up its place");
     assert_eq!(status(256, "hello").await.0, "Success");
