@@ -89,16 +89,20 @@ fn unix_lines(text: &str) -> String {
 /// # Errors
 /// Returns [`io::ErrorKind::InvalidData`] if the mark is of UTF-16, but the text is not.
 pub fn without_mark(mut bytes: Vec<u8>) -> io::Result<Vec<u8>> {
-    let (text, unit): (_, fn([u8; 2]) -> u16) = match bytes.as_slice() {
-        [0xff, 0xfe, text @ ..] => (text, u16::from_le_bytes),
-        [0xfe, 0xff, text @ ..] => (text, u16::from_be_bytes),
+    match bytes.as_slice() {
+        [0xff, 0xfe, text @ ..] => from_utf16(text, u16::from_le_bytes),
+        [0xfe, 0xff, text @ ..] => from_utf16(text, u16::from_be_bytes),
         _ => {
             if bytes.starts_with(BYTE_ORDER_MARK) {
                 bytes.drain(..BYTE_ORDER_MARK.len());
             }
-            return Ok(bytes);
+            Ok(bytes)
         }
-    };
+    }
+}
+
+/// A text in UTF-16 as UTF-8; `unit` reads two bytes in the text's order.
+fn from_utf16(text: &[u8], unit: fn([u8; 2]) -> u16) -> io::Result<Vec<u8>> {
     let (pairs, rest) = text.as_chunks::<2>();
     let units: Vec<u16> = pairs.iter().copied().map(unit).collect();
     match String::from_utf16(&units) {

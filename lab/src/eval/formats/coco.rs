@@ -62,8 +62,11 @@ pub(super) fn frames(
     }
     let mut file = ParsedFile::default();
     let of_dataset;
-    let (list, annotations, categories): (_, Vec<Annotation>, _) = if is_results(text) {
-        ("", parsed(text)?, categories)
+    let list = if is_results(text) { "" } else { "annotations" };
+    let annotations: Vec<Annotation>;
+    let categories = if is_results(text) {
+        annotations = parsed(text)?;
+        categories
     } else {
         let dataset: Dataset = parsed(text)?;
         for (place, image) in dataset.images.iter().enumerate() {
@@ -72,7 +75,8 @@ pub(super) fn frames(
             file.frames.entry(frame).or_default();
         }
         of_dataset = by_number(dataset.categories)?;
-        ("annotations", dataset.annotations, Some(&of_dataset))
+        annotations = dataset.annotations;
+        Some(&of_dataset)
     };
     let mut tracks = HashMap::new();
     let mut objects = 0;
