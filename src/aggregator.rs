@@ -461,9 +461,12 @@ impl Aggregator {
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }
 
-    /// Removes what a vehicle alone has reported so far, because its certificate was revoked or has
-    /// expired.
+    /// Removes what a vehicle alone has reported so far, and its votes, because its certificate was
+    /// revoked or has expired.
     pub fn expel(&mut self, vehicle: NodeName, now: Timestamp) {
+        if let Some(vote) = &mut self.vote {
+            vote.expel(&vehicle);
+        }
         self.expelled.add(vehicle, now);
     }
 

@@ -498,6 +498,20 @@ impl Vote {
         self.verdicts()
     }
 
+    /// Removes the votes of a vehicle and of its parts, and the evidence about it. If it votes again,
+    /// it starts as a new vehicle.
+    pub fn expel(&mut self, vehicle: &NodeName) {
+        let gone: BTreeSet<NodeName> = self
+            .last_reports
+            .keys()
+            .filter(|node| node.vehicle() == *vehicle)
+            .cloned()
+            .chain([vehicle.clone()])
+            .collect();
+        self.last_reports.retain(|node, _| !gone.contains(node));
+        self.method.get_mut().remove_vehicles(&gone);
+    }
+
     /// The reputation of each vehicle.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.method.get().reputations()

@@ -128,6 +128,42 @@ fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
 }
 
 #[test]
+fn votes_of_an_expelled_vehicle_no_longer_count() {
+    let round = RoundConfig {
+        close: RoundClose::Periodic,
+        ..RoundConfig::default()
+    };
+    let mut cell = leader(FusionConfig {
+        round,
+        ..FusionConfig::default()
+    });
+    let vote = |cell: &mut Aggregator, node: &str, label: &str, closes_ms| {
+        let report = report(node, label, closes_ms - 20);
+        cell.report(VoteDetections, &report, at(closes_ms - 10))
+            .unwrap();
+    };
+    let verdict = |cell: &mut Aggregator, closes_ms| {
+        let fused = cell.tick(at(closes_ms)).unwrap();
+        let verdict = fused.verdicts.unwrap().verdicts.remove(0);
+        (verdict.label, verdict.contributors)
+    };
+    for round in 1..=10 {
+        vote(&mut cell, "mallory", "red", round * 100);
+        vote(&mut cell, "mallory--2", "red", round * 100);
+        verdict(&mut cell, round * 100);
+    }
+    vote(&mut cell, "euclid", "green", 1100);
+    verdict(&mut cell, 1100);
+    cell.expel(NodeName::from_static("mallory"), at(1150));
+    let euclid = NodeName::from_static("euclid");
+    assert_eq!(
+        verdict(&mut cell, 1200),
+        (Some("green".into()), vec![euclid]),
+        "long before its votes are stale"
+    );
+}
+
+#[test]
 fn vehicles_that_are_expelled_one_after_the_other_leave_no_common_object() {
     let mut cell = leader(FusionConfig {
         tracks: TracksConfig {
