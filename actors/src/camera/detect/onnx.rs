@@ -325,6 +325,9 @@ pub struct OnnxDetector {
     config: OnnxConfig,
     network: Network,
     head: Head,
+    /// True if boxes of the background, where class 0 is it, are usual and not objects: the network
+    /// scores it among the classes.
+    finds_background: bool,
     /// By the network's numbers; `None` for numbers without a class.
     classes: Vec<Option<Class>>,
 }
@@ -373,9 +376,10 @@ impl OnnxDetector {
         let description = ["description", "head"]
             .map(|key| network.metadata(key).unwrap_or_default())
             .join(" ");
+        let background_first = names.as_ref().is_some_and(|stated| stated.has_background);
         let clues = Clues {
             told: config.family,
-            first_class: config.first_class,
+            first_class: config.first_class.or(background_first.then_some(1)),
             description: &description,
             input: size,
             scales_boxes: network.scales_boxes(),
@@ -400,6 +404,7 @@ impl OnnxDetector {
                 first: head.first_class,
             });
         }
+        let finds_background = background_first || !head.lists_numbers();
         let names = names.map(|stated| stated.names);
         let labels = head
             .classes(&outputs)
@@ -428,6 +433,7 @@ impl OnnxDetector {
         tracing::info!(model = %path.display(), family = %head.family, input = %size, "model loaded");
         Ok(Self {
             head,
+            finds_background,
             classes,
             network,
             config,
@@ -476,8 +482,9 @@ impl Detect for OnnxDetector {
         for candidate in self.head.decode(&outputs, input, least) {
             let contradiction = self.head.contradiction(&candidate, input);
             let is_background = candidate.class < self.head.first_class;
+            let is_contradictory = is_background && !self.finds_background;
             let zero = || "a found class is 0, the background".to_owned();
-            if let Some(what) = contradiction.or_else(|| is_background.then(zero)) {
+            if let Some(what) = contradiction.or_else(|| is_contradictory.then(zero)) {
                 return Err(DetectError::Contradiction {
                     family: self.head.family.to_string(),
                     what,
@@ -538,8 +545,7 @@ fn names(
                 path: path.clone(),
                 source,
             })?;
-            let names = labels::read(&text);
-            (Some(StatedNames { names, first: None }), path)
+            (Some(labels::read(&text)), path)
         }
         None => {
             let names = network.metadata("names").map(labels::parse).transpose();

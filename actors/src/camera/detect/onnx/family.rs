@@ -200,8 +200,7 @@ impl Head {
             x_max,
             y_max,
         } = *bounds;
-        let are_corners = matches!(self.layout, Layout::Picked(_) | Layout::Listed { .. });
-        if are_corners && (x_min > x_max || y_min > y_max) {
+        if self.lists_numbers() && (x_min > x_max || y_min > y_max) {
             return Some("a box ends before it begins, as centre and size would".into());
         }
         let are_pixels = match self.layout {
@@ -223,6 +222,11 @@ impl Head {
             return Some("a box is far outside of the image, as pixels would be".into());
         }
         None
+    }
+
+    /// True if each box has the number of its class in place of a score for each class.
+    pub(super) fn lists_numbers(&self) -> bool {
+        matches!(self.layout, Layout::Picked(_) | Layout::Listed { .. })
     }
 
     /// True if one object has several boxes.

@@ -60,32 +60,45 @@ fn by_id(id: usize) -> Option<Label> {
     coco::name(id).map(Label::from)
 }
 
-/// The names in a file: one on each line, without empty lines and without a background before the
-/// others.
-pub(super) fn read(text: &str) -> Vec<String> {
-    let mut names: Vec<String> = text
+/// The names in a file: one on each line, without empty lines.
+pub(super) fn read(text: &str) -> StatedNames {
+    let names = text
         .lines()
         .map(str::trim)
         .filter(|line| !line.is_empty())
         .map(str::to_owned)
         .collect();
-    if names.first().is_some_and(|name| is_background(name)) {
-        names.remove(0);
-    }
-    names
+    StatedNames::new(names, None)
 }
 
 fn is_background(name: &str) -> bool {
     name.trim_matches('_').eq_ignore_ascii_case("background")
 }
 
-/// The names of classes that a model states.
+/// The names of classes that a model or a file states.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct StatedNames {
     /// In the order of the classes' numbers, without a background before the others.
     pub(super) names: Vec<String>,
+    /// True if a background stood before the others.
+    pub(super) has_background: bool,
     /// Number of the first name, if the model states numbers.
     pub(super) first: Option<usize>,
+}
+
+impl StatedNames {
+    /// All stated names, and the number of the first one.
+    fn new(mut names: Vec<String>, first: Option<usize>) -> Self {
+        let has_background = names.first().is_some_and(|name| is_background(name));
+        if has_background {
+            names.remove(0);
+        }
+        Self {
+            names,
+            has_background,
+            first: first.map(|first| first + usize::from(has_background)),
+        }
+    }
 }
 
 /// The names in the metadata of a model, a list or a map in Python's or JSON's notation, such as
@@ -94,21 +107,14 @@ pub(super) struct StatedNames {
 /// # Errors
 /// Returns the fault.
 pub(super) fn parse(text: &str) -> Result<StatedNames, String> {
-    let mut stated = match literal::parse(text)? {
-        Literal::List(names) => StatedNames {
-            names: names.into_iter().map(name_of).collect::<Result<_, _>>()?,
-            first: None,
-        },
-        Literal::Map(entries) => numbered(entries)?,
-        Literal::Text(_) | Literal::Word(_) => {
-            return Err("they are neither a list nor a map".into());
+    match literal::parse(text)? {
+        Literal::List(names) => {
+            let names = names.into_iter().map(name_of).collect::<Result<_, _>>()?;
+            Ok(StatedNames::new(names, None))
         }
-    };
-    if stated.names.first().is_some_and(|name| is_background(name)) {
-        stated.names.remove(0);
-        stated.first = stated.first.map(|first| first + 1);
+        Literal::Map(entries) => numbered(entries),
+        Literal::Text(_) | Literal::Word(_) => Err("they are neither a list nor a map".into()),
     }
-    Ok(stated)
 }
 
 /// The names of a map from numbers to names, or from names to numbers, in the order of numbers.
@@ -136,10 +142,7 @@ fn numbered(entries: Vec<(Literal, Literal)>) -> Result<StatedNames, String> {
     {
         return Err(format!("class {class} has no name"));
     }
-    Ok(StatedNames {
-        names: names.into_values().collect(),
-        first,
-    })
+    Ok(StatedNames::new(names.into_values().collect(), first))
 }
 
 fn name_of(literal: Literal) -> Result<String, String> {

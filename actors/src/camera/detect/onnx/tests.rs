@@ -116,6 +116,35 @@ fn a_family_may_be_told_and_must_then_fit() {
 }
 
 #[test]
+fn a_background_among_scored_classes_is_no_object() {
+    let directory = tempfile::tempdir().unwrap();
+    for model in ["yolov5", "yolov8", "yolov8_nms"] {
+        let all = OnnxDetector::new(labelled(model))
+            .unwrap()
+            .detect(&frame())
+            .unwrap();
+        let names = directory.path().join("names.txt");
+        std::fs::write(&names, "background\ntraffic light\nit's a \"car\"\n").unwrap();
+        let found = OnnxDetector::new(OnnxConfig {
+            labels: Some(names),
+            ..config(model)
+        })
+        .unwrap()
+        .detect(&frame())
+        .unwrap();
+        let labels = found.iter().map(|object| object.label.as_str());
+        let others = all.iter().map(|object| object.label.as_str());
+        assert_eq!(
+            labels.collect::<Vec<_>>(),
+            others
+                .filter(|label| *label != "person")
+                .collect::<Vec<_>>(),
+            "{model}"
+        );
+    }
+}
+
+#[test]
 fn a_label_has_its_own_threshold() {
     let all = OnnxDetector::new(labelled("yolov5"))
         .unwrap()
@@ -317,11 +346,10 @@ fn names_are_read_from_files_and_metadata() {
         assert!(found.contains(fault), "{text}: {found}");
     }
     assert!(labels::parse(&"[".repeat(1000)).is_err());
-    assert_eq!(
-        labels::read("BACKGROUND\r\n aeroplane \n\nbicycle"),
-        ["aeroplane", "bicycle"]
-    );
-    assert_eq!(labels::read("__background__\ncat"), ["cat"]);
+    let file = labels::read("BACKGROUND\r\n aeroplane \n\nbicycle");
+    assert_eq!(file.names, ["aeroplane", "bicycle"]);
+    assert!(file.has_background);
+    assert_eq!(labels::read("__background__\ncat").names, ["cat"]);
 }
 
 #[test]
