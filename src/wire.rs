@@ -25,7 +25,7 @@
 mod cell_map;
 mod cell_reputation;
 mod client_refusals;
-mod codec;
+pub(crate) mod codec;
 mod compact;
 mod description;
 pub(crate) mod flaw;

@@ -8,7 +8,8 @@ use super::flaw;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{
-    Flaw, GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode,
+    Encoding, Flaw, GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode,
+    encode,
 };
 
 /// One line of a replay's output.
@@ -19,6 +20,16 @@ pub enum FusedLine {
     Map(GlobalMap),
     /// A round of VOTE.
     Verdicts(Verdicts),
+}
+
+impl FusedLine {
+    /// The line as JSON, without a line end.
+    pub fn to_json(&self) -> Vec<u8> {
+        match self {
+            Self::Map(map) => encode(map, Encoding::Json),
+            Self::Verdicts(verdicts) => encode(verdicts, Encoding::Json),
+        }
+    }
 }
 
 /// A report of a recording, with its kind and the virtual time of its line.

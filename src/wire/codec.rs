@@ -26,8 +26,12 @@ pub enum Encoding {
 ///
 /// # Panics
 /// Does not panic for the payloads of this crate: they serialise into memory.
-#[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
+    payload.to_bytes(encoding)
+}
+
+#[expect(clippy::expect_used, reason = "writing to memory does not fail")]
+pub(crate) fn write<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {
         Encoding::Json => {
@@ -62,7 +66,7 @@ pub fn decode_entries<T: Payload>(
     if bytes.len() > T::max_bytes(limits) {
         return Err(RejectReason::TooLarge);
     }
-    let mut payload: T = read(bytes).map_err(|reason| match schema(bytes) {
+    let mut payload = T::from_bytes(bytes).map_err(|reason| match schema(bytes) {
         Some(schema) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
         _ => reason,
     })?;
@@ -127,7 +131,7 @@ fn schema(bytes: &[u8]) -> Option<u32> {
     }
 }
 
-pub(super) fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
+pub(crate) fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
         Some(&first) if is_compact(first) => compact::read(bytes),
         _ => read_named(bytes),

@@ -7,11 +7,12 @@ use minicbor::{Decode, Encode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use super::codec;
 use super::{
-    CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState,
-    LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject,
-    PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION, Trouble, Verdict,
-    Verdicts,
+    CellDescription, CellMap, CellReputation, Encoding, FieldOfView, FusedObject, GlobalMap,
+    LandmarkState, LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport,
+    PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION,
+    Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
@@ -94,6 +95,16 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
     /// Major version that the payload states.
     fn schema(&self) -> u32;
 
+    /// The payload in an encoding. Unlike generic code, this is compiled as a part of this crate,
+    /// which is optimised for speed, whichever crate calls it; so is [`Self::from_bytes`].
+    fn to_bytes(&self, encoding: Encoding) -> Vec<u8>;
+
+    /// Reads the payload in any encoding, without checks of its values.
+    ///
+    /// # Errors
+    /// The reason for which it cannot be read.
+    fn from_bytes(bytes: &[u8]) -> Result<Self, RejectReason>;
+
     /// Maximum size in bytes.
     fn max_bytes(limits: &Limits) -> usize {
         limits.payload_bytes
@@ -128,6 +139,14 @@ macro_rules! payloads {
         $(impl Payload for $type {
             fn schema(&self) -> u32 {
                 self.schema
+            }
+
+            fn to_bytes(&self, encoding: Encoding) -> Vec<u8> {
+                codec::write(self, encoding)
+            }
+
+            fn from_bytes(bytes: &[u8]) -> Result<Self, RejectReason> {
+                codec::read(bytes)
             }
 
             fn max_bytes(limits: &Limits) -> usize {

@@ -265,8 +265,9 @@ impl RoundWriter {
     /// Writes rounds; false once the reader has closed the output.
     fn write(&mut self, rounds: &[FusedLine]) -> Result<bool, Failure> {
         for round in rounds {
-            let written = serde_json::to_writer(&mut *self.sink, round).map_err(io::Error::from);
-            let written = written.and_then(|()| self.sink.write_all(b"\n"));
+            let mut line = round.to_json();
+            line.push(b'\n');
+            let written = self.sink.write_all(&line);
             if !self.is_open(written)? {
                 return Ok(false);
             }

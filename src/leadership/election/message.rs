@@ -270,6 +270,14 @@ impl wire::Payload for ElectionMessage {
     fn schema(&self) -> u32 {
         self.schema
     }
+
+    fn to_bytes(&self, encoding: Encoding) -> Vec<u8> {
+        wire::codec::write(self, encoding)
+    }
+
+    fn from_bytes(bytes: &[u8]) -> Result<Self, RejectReason> {
+        wire::codec::read(bytes)
+    }
 }
 
 impl ElectionMessage {
