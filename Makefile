@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -53,10 +53,10 @@ demo: setup ## [start] run a whole cell as separate processes on this machine an
 	cargo build --release --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
 
-demo-picture: setup ## the animation in README.md: the street of the demo, run live
+demo-picture: PACKAGES += chromium chromium-driver python3-venv
+demo-picture: setup ## the recording in README.md: the live page while the edge of the demo's street is killed; installs Chromium
 	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-video --bin ecod-lab
-	$(PROGRAMS)/ecod-lab demo --scene street --seconds 25 --out target/demo
-	cp target/demo/street.svg docs/street.svg
+	packaging/page-recording $(PROGRAMS) docs/page.webp
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
 	cargo build --profile $(PROFILE) --locked --bin ecod-lab
@@ -155,6 +155,11 @@ lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 
 doc: setup ## API documentation in target/doc
 	cargo doc --locked --no-deps
+
+other-features: setup ## compile the node with other sets of features, and the fuzz targets
+	cargo check --locked -p ecod-actors --no-default-features --features foxglove,otel --bins --test programs
+	cargo check --locked -p ecod-actors --no-default-features --features camera --lib
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc-with-coverage cargo check --locked -p ecod-fuzz
 
 audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit

@@ -7,7 +7,6 @@
 //! available for every moment.
 
 mod depth_order;
-pub mod film;
 pub mod network_camera;
 mod route;
 mod staging;

@@ -1,7 +1,8 @@
 //! `ecod-lab demo`: a whole cell on this machine, as separate processes.
 
 use std::fs;
-use std::path::PathBuf;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -18,21 +19,31 @@ use crate::demo::street_demo::{KnownShare, StreetDemo, StreetResult};
 use crate::demo::{Demo, DemoResult, JudgedTerm, News, Progress};
 use crate::node_process::{free_address, node_program};
 use crate::street::Street;
-use crate::testbed::Testbed;
+use crate::testbed::{Scene, Testbed};
+
 use crate::testbed::birdseye::birdseye;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
 
-/// The recorded parking lots that are shown if no others are given.
+/// The recorded parking lots, of which the first is shown if no scene is named.
 const RECORDED: &str = include_str!("../../../examples/testbed/pace_setup1.json");
 
 /// Name of the street among the scenes.
 const STREET: &str = "street";
 
+/// What a newcomer has to know before the first line of a scene.
+const INTRODUCTION: &str = "\
+A cell on this machine, each node a process of its own: an edge, and nodes with a camera. Each node detects
+objects and reports them. One node, the leader, fuses all reports into one map and sends it to every node.
+The edge leads until it is killed half-way; then one of the nodes with a camera leads.
+
+";
+
 /// Flags of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct DemoArguments {
-    /// Scene file of parking lots [default: the lots of the paper's first setup, and the street]
+    /// Scene file of parking lots, all of which are run [default: the street, and the first lot of
+    /// the paper's first setup]
     #[arg(long, value_name = "FILE")]
     scenes: Option<PathBuf>,
     /// Run this scene only; `street` is the street
@@ -52,99 +63,41 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         None => Testbed::from_json(RECORDED).context("the scenes of this program"),
     };
     let testbed = testbed.map_err(Failure::usage)?;
-    let is_street = |name: &str| arguments.scenes.is_none() && name == STREET;
-    let wanted = arguments.scene.as_deref();
-    let scenes = match wanted {
-        Some(name) if is_street(name) => Vec::new(),
-        _ => select(&testbed, wanted).map_err(Failure::usage)?,
+    let (with_street, lots) = match (&arguments.scenes, arguments.scene.as_deref()) {
+        (None, None) => (true, testbed.scenes.iter().take(1).collect()),
+        (None, Some(STREET)) => (true, Vec::new()),
+        (_, name) => (false, select(&testbed, name).map_err(Failure::usage)?),
     };
-    let with_street = arguments.scenes.is_none() && wanted.is_none_or(is_street);
-    let program = node_program()?;
-    let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
     let results_file = arguments.out.join("result.json");
     fs::create_dir_all(&arguments.out)
         .with_context(|| format!("cannot make {}", arguments.out.display()))?;
     check_writable(&results_file)?;
-    let count = scenes.len() + usize::from(with_street);
-    let in_street = with_street.then(|| Street::default().cameras.len());
-    let most = scenes
-        .iter()
-        .map(|scene| scene.cavs.len())
-        .chain(in_street)
-        .max()
-        .unwrap_or(0);
-    print(&format!(
-        "a cell on this machine: 1 edge, killed half-way, {most} nodes that see, report and may lead, {count} scenes\n\n"
-    ))?;
-    let (dashboard, duration) = (free_address()?, Duration::from_secs(arguments.seconds));
-    print(&format!("watch it at http://{dashboard}/\n\n"))?;
-    let mut results = Vec::with_capacity(scenes.len());
-    for (index, scene) in scenes.into_iter().enumerate() {
-        let directory = arguments.out.join(file_name(&scene.name));
-        let demo = Demo {
-            program: &program,
-            testbed: &testbed,
-            scene,
-            duration,
-            directory: &directory,
-            dashboard,
-        };
-        print(&format!(
-            "[{}/{count}] {}: starting {} processes\n",
-            index + 1,
-            scene.name,
-            scene.cavs.len() + 1
-        ))?;
-        let outcome = runtime.block_on(until_signalled(demo.run(tell)));
-        let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
-        print(&format!(
-            "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
-            outcome.maps,
-            outcome.missed,
-            outcome.median_age.as_secs_f64() * 1e3,
-        ))?;
-        print(&leaders(&outcome.terms, outcome.from, "spots"))?;
-        let picture = arguments
-            .out
-            .join(format!("{}.svg", file_name(&scene.name)));
-        let svg = birdseye(
-            &testbed,
-            scene,
-            &detections(&outcome),
-            outcome.last_map.as_ref(),
-        )
-        .context("picture")?;
-        fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
-        results.push(outcome.result);
-    }
-    let street = if let Some(cameras) = in_street {
-        let processes = cameras + 1;
-        print(&format!(
-            "[{count}/{count}] {STREET}: starting {processes} processes and {cameras} network cameras\n"
-        ))?;
-        let directory = arguments.out.join(STREET);
-        let demo = StreetDemo {
-            program: &program,
-            duration,
-            directory: &directory,
-            dashboard,
-        };
-        let outcome = runtime
-            .block_on(until_signalled(demo.run(tell)))
-            .context("the street")?;
-        print(&leaders(&outcome.terms, outcome.from, "objects"))?;
-        let film = arguments.out.join(format!("{STREET}.svg"));
-        fs::write(&film, &outcome.film)
-            .with_context(|| format!("cannot write {}", film.display()))?;
-        Some(outcome.result)
+    let show = Show {
+        program: node_program()?,
+        runtime: tokio::runtime::Runtime::new().context("no threads for the demo")?,
+        duration: Duration::from_secs(arguments.seconds),
+        out: &arguments.out,
+        dashboard: free_address()?,
+    };
+    print(INTRODUCTION)?;
+    print(&format!("watch it at http://{}/\n\n", show.dashboard))?;
+    let count = lots.len() + usize::from(with_street);
+    let street = if with_street {
+        print(&format!("[1/{count}] "))?;
+        Some(show.street()?)
     } else {
         None
     };
-    if !results.is_empty() {
-        print(&format!("\n{}", table(&results)))?;
+    let mut results = Vec::with_capacity(lots.len());
+    for (index, lot) in (1 + usize::from(with_street)..).zip(lots) {
+        print(&format!("[{index}/{count}] "))?;
+        results.push(show.lot(&testbed, lot)?);
     }
     if let Some(street) = &street {
         print(&format!("\n{}", street_table(street)))?;
+    }
+    if !results.is_empty() {
+        print(&format!("\n{}", table(&results)))?;
     }
     write_json(
         &results_file,
@@ -154,9 +107,78 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         },
     )?;
     Ok(print(&format!(
-        "\npictures, results, configurations and logs: {}\n",
-        arguments.out.display()
+        "\npictures, results, configurations and logs: {}\nnext: a map of your own video, with {} try --video FILE\n",
+        arguments.out.display(),
+        show.program.display()
     ))?)
+}
+
+/// How all scenes are run.
+struct Show<'a> {
+    program: PathBuf,
+    runtime: tokio::runtime::Runtime,
+    duration: Duration,
+    out: &'a Path,
+    dashboard: SocketAddr,
+}
+
+impl Show<'_> {
+    fn street(&self) -> anyhow::Result<StreetResult> {
+        let cameras = Street::default().cameras.len();
+        let processes = cameras + 1;
+        print(&format!(
+            "{STREET}: starting {processes} processes and {cameras} network cameras\n"
+        ))?;
+        let directory = self.out.join(STREET);
+        let demo = StreetDemo {
+            program: &self.program,
+            duration: self.duration,
+            directory: &directory,
+            dashboard: self.dashboard,
+        };
+        let outcome = self
+            .runtime
+            .block_on(until_signalled(demo.run(tell)))
+            .context("the street")?;
+        print(&leaders(&outcome.terms, outcome.from, "objects"))?;
+        Ok(outcome.result)
+    }
+
+    fn lot(&self, testbed: &Testbed, scene: &Scene) -> anyhow::Result<SceneResult> {
+        let name = &scene.name;
+        let directory = self.out.join(file_name(name));
+        let demo = Demo {
+            program: &self.program,
+            testbed,
+            scene,
+            duration: self.duration,
+            directory: &directory,
+            dashboard: self.dashboard,
+        };
+        print(&format!(
+            "{name}: starting {} processes\n",
+            scene.cavs.len() + 1
+        ))?;
+        let outcome = self.runtime.block_on(until_signalled(demo.run(tell)));
+        let outcome = outcome.with_context(|| format!("scene {name}"))?;
+        print(&format!(
+            "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
+            outcome.maps,
+            outcome.missed,
+            outcome.median_age.as_secs_f64() * 1e3,
+        ))?;
+        print(&leaders(&outcome.terms, outcome.from, "spots"))?;
+        let picture = self.out.join(format!("{}.svg", file_name(name)));
+        let svg = birdseye(
+            testbed,
+            scene,
+            &detections(&outcome),
+            outcome.last_map.as_ref(),
+        )
+        .context("picture")?;
+        fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
+        Ok(outcome.result)
+    }
 }
 
 /// The file of results.
@@ -220,7 +242,7 @@ fn street_table(street: &StreetResult) -> String {
         (None, _) => "nobody led after it".to_owned(),
     };
     format!(
-        "street: {} cars and people, known within 2 m\n{:<8}{:^26}   {:^26}\n{:<8}{}   {}\n{}the edge was killed: {failover}\n{}",
+        "street: {} cars and people; known: found within 2 m, on average; precision: share of a node's objects that are real;\nrecall: share of the real objects that it has\n{:<8}{:^26}   {:^26}\n{:<8}{}   {}\n{}the edge was killed: {failover}\n{}",
         street.objects,
         "",
         "alone",

@@ -47,7 +47,6 @@ pub(super) struct Played {
     pub(super) from: Timestamp,
     pub(super) until: Timestamp,
     pub(super) killed_at: Option<Timestamp>,
-    pub(super) restarted_at: Option<Timestamp>,
 }
 
 /// Time for all nodes to start and detect objects.
@@ -234,7 +233,6 @@ async fn watch(
         from,
         until: from,
         killed_at: None,
-        restarted_at: None,
     };
     let (kill_at, restart_at) = (from + duration / 2, from + duration / 2 + EDGE_GONE);
     let mut next_progress = from;
@@ -254,7 +252,6 @@ async fn watch(
             tell(News::EdgeKilled)?;
         } else if edge.is_killed() && now >= restart_at {
             edge.restart()?;
-            played.restarted_at = Some(now);
             tell(News::EdgeStarted)?;
         } else if now >= next_progress {
             next_progress = now + Duration::from_secs(1);

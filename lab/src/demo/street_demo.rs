@@ -12,7 +12,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Context;
 use ecod::aggregator::round::RoundConfig;
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use ecod::model::names::NodeName;
@@ -39,7 +38,6 @@ use super::judged_term::{JudgedTerm, judged_terms};
 use super::report_collector::ObservedReport;
 use super::stage::{Played, Progress, Stage};
 use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
-use crate::street::film::{FORGOTTEN, Film, KnownMap};
 use crate::street::network_camera::{FRAMES_PER_S, NetworkCamera};
 use crate::street::{Carrier, Street, StreetCamera};
 
@@ -65,8 +63,6 @@ pub struct StreetOutcome {
     pub from: Timestamp,
     /// Terms of all leaders, in order.
     pub terms: Vec<JudgedTerm>,
-    /// An animation of it, as SVG.
-    pub film: String,
 }
 
 /// Figures of the street.
@@ -104,6 +100,9 @@ pub struct KnownShare {
 
 /// Time between two moments that are evaluated.
 const STEP: Duration = Duration::from_millis(100);
+
+/// Age of a map from which on a node counts as having no objects.
+const FORGOTTEN: Duration = Duration::from_secs(1);
 
 /// Time between two poses of a vehicle that drives.
 const POSE_PERIOD: Duration = Duration::from_millis(50);
@@ -145,9 +144,8 @@ impl StreetDemo<'_> {
             .play(configs, self.dashboard, observer, self.duration, progress)
             .await;
         localisation.abort();
-        let mut pictures = Vec::new();
         for camera in cameras {
-            pictures.push(camera.stop().await?);
+            camera.stop().await?;
         }
         let played = played?;
         let mut logs = Vec::new();
@@ -162,37 +160,11 @@ impl StreetDemo<'_> {
         };
         let terms = judge.terms(&logs);
         let result = judge.result(&played, &logs, &terms);
-        let (first, log) = logs.first().context("no camera")?;
-        let alone = judge.alone(first, &played.reports);
-        let film = Film {
-            street: &street,
-            start,
-            edge: edge_name(),
-            maps: log.iter().map(known).collect(),
-            alone: alone.iter().map(known).collect(),
-            reports: played
-                .reports
-                .iter()
-                .map(|observed| &*observed.report)
-                .collect(),
-            pictures: &pictures,
-            killed_at: played.killed_at.context("the edge was not killed")?,
-            restarted_at: played.restarted_at,
-            ends: [played.from, played.until],
-        };
         Ok(StreetOutcome {
             from: played.from,
-            film: film.draw(),
             terms,
             result,
         })
-    }
-}
-
-fn known(line: &ReceivedMap) -> KnownMap<'_> {
-    KnownMap {
-        known_at: line.received_at,
-        map: &line.map,
     }
 }
 

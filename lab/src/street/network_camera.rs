@@ -1,17 +1,16 @@
 //! A camera of the street on the network: MJPEG over HTTP, as IP cameras send it.
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
 use anyhow::Context;
 use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
-use opencv::core::{Mat, Size, Vector};
+use opencv::core::{Mat, Vector};
 use opencv::imgcodecs::{IMWRITE_JPEG_QUALITY, imencode};
-use opencv::imgproc::{INTER_AREA, resize};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::watch;
@@ -24,21 +23,8 @@ use crate::testbed::camera::sensor::Sensor;
 /// Pictures a second.
 pub const FRAMES_PER_S: f64 = 5.0;
 
-/// Quality of the sent and kept pictures.
+/// Quality of the sent pictures.
 const QUALITY: i32 = 90;
-const KEPT_QUALITY: i32 = 60;
-
-/// Width and height in pixels of the pictures that are kept.
-pub const KEPT_PX: [i32; 2] = [240, 180];
-
-/// A small JPEG of a camera's picture.
-#[derive(Debug, Clone)]
-pub struct KeptPicture {
-    /// When it was taken.
-    pub taken_at: Timestamp,
-    /// The file.
-    pub jpeg: Vec<u8>,
-}
 
 /// Bytes that wait for a vehicle in this process's socket.
 const SEND_BUFFER: u32 = 1 << 14;
@@ -52,7 +38,6 @@ type Jpeg = Arc<Vec<u8>>;
 pub struct NetworkCamera {
     address: SocketAddr,
     end: EndOnDrop,
-    kept: Arc<Mutex<Vec<KeptPicture>>>,
     thread: JoinHandle<anyhow::Result<()>>,
 }
 
@@ -89,10 +74,7 @@ impl NetworkCamera {
         let listener = socket.listen(8)?;
         let address = listener.local_addr()?;
         let (newest, pictures) = watch::channel(Jpeg::default());
-        let (ended, kept) = (
-            Arc::<AtomicBool>::default(),
-            Arc::<Mutex<Vec<KeptPicture>>>::default(),
-        );
+        let ended = Arc::<AtomicBool>::default();
         let phase = number as f64 / street.cameras.len() as f64;
         let view = StreetView::new(street)?;
         let shoot = Shooting {
@@ -104,8 +86,8 @@ impl NetworkCamera {
             newest,
         };
         let thread = spawn_blocking({
-            let (ended, kept) = (Arc::clone(&ended), Arc::clone(&kept));
-            move || shoot.run(&ended, &kept)
+            let ended = Arc::clone(&ended);
+            move || shoot.run(&ended)
         });
         let end = EndOnDrop {
             ended,
@@ -114,7 +96,6 @@ impl NetworkCamera {
         Ok(Self {
             address,
             end,
-            kept,
             thread,
         })
     }
@@ -124,18 +105,15 @@ impl NetworkCamera {
         format!("http://{}/video", self.address)
     }
 
-    /// Ends the camera and returns the pictures that it kept, in the order of time.
+    /// Ends the camera.
     ///
     /// # Errors
     /// Returns an error if a picture could not be rendered.
-    pub async fn stop(self) -> anyhow::Result<Vec<KeptPicture>> {
+    pub async fn stop(self) -> anyhow::Result<()> {
         drop(self.end);
         self.thread
             .await
-            .context("a camera of the street has failed")??;
-        Ok(std::mem::take(
-            &mut *self.kept.lock().unwrap_or_else(PoisonError::into_inner),
-        ))
+            .context("a camera of the street has failed")?
     }
 }
 
@@ -152,7 +130,7 @@ struct Shooting {
 impl Shooting {
     /// Each picture is rendered before its time and sent at its time, so that no vehicle takes the
     /// time of rendering for a delay.
-    fn run(self, ended: &AtomicBool, kept: &Mutex<Vec<KeptPicture>>) -> anyhow::Result<()> {
+    fn run(self, ended: &AtomicBool) -> anyhow::Result<()> {
         let camera: &StreetCamera = &self.street.cameras[self.number];
         let mut sensor = None;
         let (mut frame, mut takes) = (0, Duration::ZERO);
@@ -166,23 +144,7 @@ impl Shooting {
             let still = self.view.render(&self.street, camera, at_s)?;
             let sensor = sensor.get_or_insert_with(|| Sensor::new(&still, self.number as u64));
             let picture = sensor.expose(&still, frame)?;
-            let jpeg = encode(&picture, QUALITY)?;
-            let mut small = Mat::default();
-            resize(
-                &picture,
-                &mut small,
-                Size::new(KEPT_PX[0], KEPT_PX[1]),
-                0.0,
-                0.0,
-                INTER_AREA,
-            )?;
-            let small = KeptPicture {
-                taken_at,
-                jpeg: encode(&small, KEPT_QUALITY)?,
-            };
-            kept.lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .push(small);
+            let jpeg = encode(&picture)?;
             takes = clock::now().since(began);
             thread::sleep(taken_at.since(clock::now()));
             if clock::now().since(taken_at) < LATEST {
@@ -194,13 +156,13 @@ impl Shooting {
     }
 }
 
-fn encode(picture: &Mat, quality: i32) -> opencv::Result<Vec<u8>> {
+fn encode(picture: &Mat) -> opencv::Result<Vec<u8>> {
     let mut jpeg = Vector::new();
     imencode(
         ".jpg",
         picture,
         &mut jpeg,
-        &Vector::from_slice(&[IMWRITE_JPEG_QUALITY, quality]),
+        &Vector::from_slice(&[IMWRITE_JPEG_QUALITY, QUALITY]),
     )?;
     Ok(jpeg.into())
 }

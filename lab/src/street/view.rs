@@ -160,14 +160,14 @@ fn print(label: &Label) -> anyhow::Result<Mat> {
 }
 
 /// From the world to the frame of a camera.
-pub(super) struct StreetSight {
+struct StreetSight {
     pose: Pose,
     height_m: f64,
     from_level: Matrix3<f64>,
 }
 
 impl StreetSight {
-    pub(super) fn new(pose: Pose, mount: &Mount) -> Self {
+    fn new(pose: Pose, mount: &Mount) -> Self {
         let (pose, height_m) = (mount.camera_pose(&pose), mount.height_m.unwrap_or_default());
         Self {
             pose,
@@ -177,7 +177,7 @@ impl StreetSight {
     }
 
     /// A point of the world in the camera frame, in metres.
-    pub(super) fn point(&self, place: &Point2<f64>, height_m: f64) -> Point3<f64> {
+    fn point(&self, place: &Point2<f64>, height_m: f64) -> Point3<f64> {
         let offset = place - self.pose.position;
         let (sin, cos) = self.pose.heading_rad.sin_cos();
         let level = Vector3::new(

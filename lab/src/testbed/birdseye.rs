@@ -146,8 +146,7 @@ impl MarkKind {
 
 /// Fill of each vehicle in turn: colours of Okabe and Ito that differ clearly from the colours of a
 /// [`MarkKind`].
-pub(crate) const VEHICLE_COLORS: [&str; 5] =
-    ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
+const VEHICLE_COLORS: [&str; 5] = ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
 const FAINT: &str = "#8a8a8a";
 /// Height of a line of text in pixels.
 const LINE_PX: f64 = 18.0;

@@ -196,11 +196,8 @@ fn in_the_street_the_cell_knows_more_than_any_camera_and_survives_its_edge() {
         street["seen_only_by"]["galileo"].as_u64() > Some(0),
         "{told}"
     );
-    let film = std::fs::read_to_string(directory.path().join("street.svg")).unwrap();
     assert!(
-        film.len() < 2_000_000
-            && film.contains("seen only by galileo")
-            && film.contains("edge is killed")
+        told.contains("precision:") && told.contains("next: ") && told.contains(" try --video"),
+        "words are explained and the next command is shown: {told}"
     );
-    roxmltree::Document::parse(&film).unwrap();
 }
