@@ -61,7 +61,7 @@ pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;
 pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
-pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
+pub use trouble::{MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
     InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER,
     MAX_SHARE_ENTRIES, Payload, check_fused_at,
@@ -443,6 +443,11 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(11)]
     pub page: Option<String>,
+    /// Absent nodes that are not expected to return: the node itself after an orderly stop, and
+    /// nodes that an operator has dismissed at this node.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(12), with = "skip_empty", has_nil)]
+    pub dismissed: Vec<NodeName>,
 }
 
 impl NodeStatus {
@@ -461,6 +466,7 @@ impl NodeStatus {
             description: None,
             troubles: Vec::new(),
             page: None,
+            dismissed: Vec::new(),
         }
     }
 }

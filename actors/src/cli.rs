@@ -81,7 +81,7 @@ enum Command {
     /// Make the certificates of a cell by hand: its CA, one per node, and the revocation list
     #[command(subcommand)]
     Pki(pki::PkiCommand),
-    /// The settings that all nodes of a cell share: set, show, compare
+    /// The settings that all nodes of a cell share: set, show, compare; dismiss a missing node
     #[command(subcommand)]
     Cell(cell::CellCommand),
     /// Drop the evidence behind the reputations, the highest term, or the cell's description, of a

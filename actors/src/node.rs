@@ -256,6 +256,13 @@ impl NodeHandle {
         self.members.clone()
     }
 
+    /// The other nodes of the cell that answer, without observers.
+    pub fn other_nodes(&self) -> Vec<Member> {
+        let members = self.members.borrow();
+        let nodes = members.iter().filter(|member| !member.name.is_part());
+        nodes.cloned().collect()
+    }
+
     /// The cell's leadership, as it changes.
     pub fn leadership(&self) -> watch::Receiver<Leadership> {
         self.leadership.clone()

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use ecod::diagnostics::in_words;
 use ecod::leadership::Leadership;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
@@ -73,7 +74,7 @@ impl CellView {
             now,
             leadership: node.leadership().borrow().clone(),
             history,
-            members: node.members().borrow().clone(),
+            members: node.other_nodes(),
             map: node.newest_map().borrow().clone(),
             verdicts: node.newest_verdicts().borrow().clone(),
             reputations: node.newest_reputations().borrow().clone(),
@@ -139,7 +140,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         (Some(leader), Some(epoch)) => {
             let since = view.history.back().filter(|(newest, _)| newest == epoch);
             let since = since.map_or_else(String::new, |(_, at)| {
-                format!(", seen for {}", span(view.now.since(*at)))
+                format!(", seen for {}", in_words(view.now.since(*at)))
             });
             let standby = view
                 .leadership
@@ -159,7 +160,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         .map(|(_, received_at)| view.now.since(received_at))
     {
         Some(age) if view.patience.is_some_and(|patience| age > patience) => {
-            Span::from(format!("STALE: no round for {}", span(age)))
+            Span::from(format!("STALE: no round for {}", in_words(age)))
                 .bold()
                 .red()
         }
@@ -398,14 +399,6 @@ fn counted(view: &CellView) -> Table<'_> {
     };
     Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)])
         .block(Block::bordered().title(title))
-}
-
-fn span(time: Duration) -> String {
-    match time.as_secs() {
-        seconds @ 0..120 => format!("{seconds} s"),
-        seconds @ 120..7200 => format!("{} min", seconds / 60),
-        seconds => format!("{} h", seconds / 3600),
-    }
 }
 
 #[cfg(test)]

@@ -189,6 +189,7 @@ impl Actor for Gateway {
         let gone = NodeStatus {
             state: NodeState::Offline,
             troubles: Vec::new(),
+            dismissed: vec![state.status.node.clone()],
             ..state.status.clone()
         };
         state.set_status(gone);

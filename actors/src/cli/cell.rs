@@ -1,5 +1,5 @@
-//! `ecod-node cell`: the settings that all nodes of a cell share, through the local broker of one
-//! of them.
+//! `ecod-node cell`: the settings that all nodes of a cell share, and the dismissal of missing
+//! nodes, through the local broker of one node.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
+use bytes::Bytes;
 use clap::{Args, Subcommand};
 use ecod::description::DescriptionHistory;
 use ecod::leadership::BrokerAddress;
@@ -43,6 +44,13 @@ pub(super) enum CellCommand {
     },
     /// Print the description that the cell has, and which nodes use it
     Show {
+        #[command(flatten)]
+        door: DoorArguments,
+    },
+    /// Stop expecting a node that is gone for good, so that no node reports it as missing
+    Dismiss {
+        /// Name of the missing node
+        node: NodeName,
         #[command(flatten)]
         door: DoorArguments,
     },
@@ -98,6 +106,10 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
             set(client, &text).await
         }
         CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
+        CellCommand::Dismiss { node, door } => {
+            DoorClient::open(door).await?.dismiss(node).await?;
+            Ok(print(&format!("{node} is not expected any more\n"))?)
+        }
         CellCommand::Diff { file, door } => {
             let text = read(file)?;
             let described = DoorClient::open(door).await?.present().await?;
@@ -316,6 +328,21 @@ impl DoorClient {
             let description = self.present().await?;
             if description.version > 0 && description.text == request.text {
                 return Ok(description);
+            }
+        }
+    }
+
+    /// Dismisses a missing node; returns when the connected node has confirmed it.
+    async fn dismiss(&mut self, node: &NodeName) -> Result<(), anyhow::Error> {
+        self.present().await?;
+        let topic = self.topics.path(&Topic::Nodes(node.clone()));
+        self.client
+            .publish(&topic, &Bytes::new(), Retention::Acknowledged);
+        loop {
+            if let DoorMessage::Status(status) = self.expect().await?
+                && status.dismissed.contains(node)
+            {
+                return Ok(());
             }
         }
     }
