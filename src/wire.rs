@@ -40,6 +40,7 @@ mod trouble;
 mod validation;
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
@@ -487,6 +488,16 @@ pub enum Role {
     /// Always the preferred aggregator; has no camera.
     #[n(2)]
     Edge,
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Auto => "auto",
+            Self::Cav => "cav",
+            Self::Edge => "edge",
+        })
+    }
 }
 
 /// The current state of a node.

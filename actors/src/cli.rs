@@ -4,6 +4,7 @@
 mod calibrate;
 mod cell;
 mod doctor;
+mod installation;
 mod join;
 pub mod lines;
 mod logging;
@@ -16,10 +17,12 @@ mod reset;
 mod run;
 mod schema;
 mod shell;
+mod status;
 mod top;
 #[cfg(feature = "camera")]
 mod trial;
 
+use std::fmt;
 use std::io::{ErrorKind, Write};
 use std::process::ExitCode;
 
@@ -61,6 +64,9 @@ enum Command {
     Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     Doctor(doctor::DoctorArguments),
+    /// Print the state of this machine's node: readiness, leader, nodes and troubles. Ends with 0 if
+    /// it is ready, 5 if not, 6 if no node answers
+    Status(status::StatusArguments),
     /// Join a cell as an observer and show it in the terminal
     Top(top::TopArguments),
     /// Join a cell as an observer and record all its messages (MCAP)
@@ -120,6 +126,12 @@ const NAME_TAKEN: u8 = 4;
 /// Exit code for input that is unusable or almost unusable.
 const REJECTED: u8 = 3;
 
+/// Exit code of `status` for a node that is not ready.
+const NOT_READY: u8 = 5;
+
+/// Exit code of `status` if no node answers.
+const NO_NODE: u8 = 6;
+
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
@@ -129,9 +141,9 @@ pub fn main() -> ExitCode {
 pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { error, code }) => {
-            eprintln!("{program}: {error:#}");
-            ExitCode::from(code)
+        Err(failure) => {
+            eprintln!("{program}: {failure}");
+            ExitCode::from(failure.code)
         }
     }
 }
@@ -181,6 +193,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         #[cfg(feature = "camera")]
         Some(Command::Try(arguments)) => trial::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
+        Some(Command::Status(arguments)) => status::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
@@ -212,6 +225,12 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:#}", self.error)
+    }
+}
+
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         Self { error, code: 1 }
@@ -232,6 +251,22 @@ impl Failure {
         Self {
             error: error.into(),
             code: USAGE,
+        }
+    }
+
+    /// A node that is not ready.
+    fn not_ready(error: anyhow::Error) -> Self {
+        Self {
+            error,
+            code: NOT_READY,
+        }
+    }
+
+    /// A node that does not answer.
+    fn no_node(error: anyhow::Error) -> Self {
+        Self {
+            error,
+            code: NO_NODE,
         }
     }
 

@@ -13,7 +13,7 @@ use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
-use ratatui::widgets::{Block, Paragraph, Row, Table};
+use ratatui::widgets::{Block, Paragraph, Row, Table, Wrap};
 
 use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
@@ -51,6 +51,8 @@ pub struct CellView {
     pub reputations: Option<Received<Reputations>>,
     /// Current troubles of the cell, with the node that reports each.
     pub troubles: Vec<(Option<NodeName>, Trouble)>,
+    /// How vehicles begin to report, for a cell without reports.
+    pub guide: String,
     /// The observer's counters.
     pub counters: CounterSnapshot,
     /// Number of lines above the first visible one.
@@ -79,6 +81,7 @@ impl CellView {
             verdicts: node.newest_verdicts().borrow().clone(),
             reputations: node.newest_reputations().borrow().clone(),
             troubles: node.troubles(),
+            guide: config.reporting(None),
             counters: node.counters().snapshot(),
             scroll,
         };
@@ -129,7 +132,11 @@ pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     let table = locations(view, places.height);
     frame.render_widget(summary(view), head);
     frame.render_widget(troubles(view), wrong);
-    frame.render_widget(table, places);
+    if location_rows(view).is_empty() {
+        frame.render_widget(guide(view), places);
+    } else {
+        frame.render_widget(table, places);
+    }
     frame.render_widget(vehicles(view), nodes);
     frame.render_widget(counted(view), losses);
     frame.render_widget(Line::from(" q: quit, arrow keys: scroll").dim(), foot);
@@ -235,6 +242,13 @@ fn locations(view: &mut CellView, height: u16) -> Table<'static> {
         .block(Block::bordered().title(title))
 }
 
+/// The next step of a user whose cell has no reports.
+fn guide(view: &CellView) -> Paragraph<'_> {
+    Paragraph::new(view.guide.as_str())
+        .wrap(Wrap { trim: true })
+        .block(Block::bordered().title(" what is where "))
+}
+
 fn location_rows(view: &CellView) -> Vec<Row<'static>> {
     let verdicts = || {
         view.verdicts
@@ -328,7 +342,7 @@ fn vehicles(view: &CellView) -> Table<'_> {
         };
         Row::new([
             member.name.to_string(),
-            format!("{:?}", member.role).to_lowercase(),
+            member.role.to_string(),
             part.to_owned(),
             trusted(&member.name),
         ])
@@ -456,6 +470,7 @@ mod tests {
                 is_yielding: false,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
+            guide: "no vehicle reports yet: run this".into(),
             members: vec![Member {
                 name: name("gauss"),
                 run: 0,
@@ -634,5 +649,20 @@ mod tests {
         for (width, height) in [(1, 1), (20, 5), (40, 12)] {
             shown(&mut view(Timestamp(0)), width, height);
         }
+    }
+
+    #[test]
+    fn a_cell_without_reports_is_told_the_next_step() {
+        let now = Timestamp(0) + Duration::from_secs(9);
+        let mut view = CellView {
+            map: None,
+            verdicts: None,
+            ..view(now)
+        };
+        let shown = shown(&mut view, 80, 30);
+        assert!(
+            shown.contains("no vehicle reports yet: run this"),
+            "{shown}"
+        );
     }
 }

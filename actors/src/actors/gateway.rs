@@ -502,7 +502,7 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 /// Delivers the new state of a link to this node's actors.
 fn tell_state(inbox: &Inbox, link: &Link) {
     let (broker, state) = (link.broker.clone(), link.state);
-    tracing::info!(%broker, ?state, "link changed");
+    tracing::info!(%broker, %state, "link changed");
     inbox.deliver_link(
         Via {
             address: &broker,

@@ -19,7 +19,7 @@ use ecod::wire::{MAX_DESCRIPTION_BYTES, decode, encode};
 use serde_json::{Map, Value, json};
 use uuid::Uuid;
 
-use super::{Failure, print};
+use super::{Failure, installation, print};
 use crate::node::config::{NodeConfig, SharedConfig};
 use crate::node::description::description_file;
 use crate::platform::bounded_file;
@@ -66,7 +66,8 @@ pub(super) enum CellCommand {
 /// Flags that name a node of this machine.
 #[derive(Debug, Args)]
 pub(super) struct DoorArguments {
-    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
+    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node [default,
+    /// without --cell and --door: /etc/ecod/node.toml or ecod/node.toml, if it exists]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Name of the cell
@@ -76,9 +77,6 @@ pub(super) struct DoorArguments {
     #[arg(long, value_name = "IP:PORT")]
     door: Option<SocketAddr>,
 }
-
-/// Configuration of the machine's node, if it was made by `init`, `join` or the package.
-const SERVICE_CONFIGURATION: &str = "/etc/ecod/node.toml";
 
 /// Maximum time for the node's answer.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -201,8 +199,13 @@ impl DoorClient {
                 .as_ref()
                 .map(|cell| ("cell".to_owned(), json!(cell))),
         );
-        let mut config =
-            NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
+        let given = arguments.config.as_deref();
+        let file = if arguments.cell.is_none() && arguments.door.is_none() {
+            installation::configuration(given)
+        } else {
+            given.map(Path::to_owned)
+        };
+        let mut config = NodeConfig::load(file.as_deref(), &flags).map_err(Failure::usage)?;
         // Version 5 has reasons for refusals; the local broker requires no password.
         config.mqtt.version = MqttVersion::V5;
         (config.mqtt.user, config.mqtt.password) = (None, None);
@@ -232,14 +235,7 @@ impl DoorClient {
         };
         let accepted = door.connection.next(PATIENCE).await;
         accepted.with_context(|| {
-            let unread = arguments.config.is_none() && Path::new(SERVICE_CONFIGURATION).exists();
-            let remedy = match unread {
-                true => {
-                    format!("`--config {SERVICE_CONFIGURATION}` reads that of this machine's node")
-                }
-                false => "`--door` names another address of it".to_owned(),
-            };
-            format!("no node at {address}: it must run on this machine; {remedy}")
+            format!("no node at {address}: it must run on this machine; `--door` names another address of it")
         })?;
         let filters = [
             door.topics.path(&Topic::Cell),

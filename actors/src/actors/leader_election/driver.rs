@@ -333,7 +333,7 @@ impl ElectionDriver {
                     .reject(RejectReason::NotPermitted, from.as_str());
                 if self.overreached.insert(from.clone()) {
                     tracing::warn!(
-                        %from, ?role, priority, ?rights,
+                        %from, %role, priority, allowed_role = %rights.role, allowed_priority = rights.priority,
                         "a node declares more than its certificate allows and counts as what that says; issue it a \
                          certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
                     );
@@ -418,7 +418,7 @@ impl ElectionDriver {
         if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
             tracing::info!(
-                ?position,
+                %position,
                 leader = epoch,
                 standby,
                 "the leader or the standby has changed"
@@ -438,6 +438,12 @@ impl ElectionDriver {
             superseded.abort();
         }
     }
+}
+
+/// Names in one text.
+fn list(names: &[NodeName]) -> String {
+    let names: Vec<_> = names.iter().map(NodeName::as_str).collect();
+    names.join(", ")
 }
 
 /// Converts a member to the form that the node's leadership needs.
@@ -538,7 +544,7 @@ fn log(notice: Notice) {
             );
         }
         Notice::OutOfReach { members } => tracing::warn!(
-            ?members,
+            members = list(&members),
             "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),

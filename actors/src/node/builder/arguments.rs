@@ -420,6 +420,8 @@ impl NodeBuilder {
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
+            guide: self.config.reporting(*self.vehicle.listens_at.borrow()),
+            certificate_ends_us: None,
         };
         let sources = NodeSources {
             node,

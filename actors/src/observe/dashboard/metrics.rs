@@ -60,7 +60,7 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
     let labels = vec![
         ("node", facts.name.to_string()),
         ("cell", facts.cell.to_string()),
-        ("role", format!("{:?}", facts.role).to_lowercase()),
+        ("role", facts.role.to_string()),
         ("version", facts.version.to_owned()),
     ];
     gauges(

@@ -128,7 +128,7 @@ impl NodeMonitor {
             .links
             .iter()
             .flatten()
-            .map(|(broker, state)| (broker.to_string(), format!("{state:?}").to_lowercase()));
+            .map(|(broker, state)| (broker.to_string(), state.to_string()));
         Snapshot {
             schema: API_VERSION,
             now_us: now,
