@@ -51,7 +51,7 @@ setup: ## [start] install the system packages that are missing
 
 demo: setup ## [start] run a whole cell as separate processes on this machine and print its accuracy
 	cargo build --release --locked --bin ecod-node --bin ecod-video --bin ecod-lab
-	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
+	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --output target/demo
 
 demo-picture: PACKAGES += chromium chromium-driver python3-venv
 demo-picture: setup ## the recording in README.md: the live page while the edge of the demo's street is killed; installs Chromium
@@ -61,8 +61,8 @@ demo-picture: setup ## the recording in README.md: the live page while the edge 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
 	cargo build --profile $(PROFILE) --locked --bin ecod-lab
 	for setup in 1 2; do $(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
-	    --at-least 99.5 --occupied-at-least 99 --out target/testbed-setup$$setup.json || exit; done
-	$(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
+	    --at-least 99.5 --occupied-at-least 99 --output target/testbed-setup$$setup.json || exit; done
+	$(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --output target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 # OPTIONS="--seconds 20" takes other options of packaging/compare.

@@ -417,7 +417,7 @@ fn judge(
     run(eval
         .arg("--reports")
         .arg(&reports)
-        .arg("--out")
+        .arg("--output")
         .arg(&result))?;
     Ok(serde_json::from_slice(&fs::read(&result)?)?)
 }

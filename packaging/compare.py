@@ -290,7 +290,7 @@ def accuracy(lab: str, work: pathlib.Path, verdicts: int) -> dict[str, str]:
         for scene in testbed["scenes"]:
             out, lines = work / "scene.json", work / "reports.jsonl"
             subprocess.run(
-                [lab, "testbed", "--scenes", path, "--scene", scene["name"], "--verdicts", str(verdicts), "--out", out, "--reports", lines],
+                [lab, "testbed", "--scenes", path, "--scene", scene["name"], "--verdicts", str(verdicts), "--output", out, "--reports", lines],
                 check=True,
                 stdout=subprocess.DEVNULL,
             )

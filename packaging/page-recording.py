@@ -19,7 +19,7 @@ WINDOW_PX = (1180, 900)
 
 def started_demo(programs, directory):
     """Runs the street; returns the process and a queue of the lines that it prints."""
-    command = [f"{programs}/ecod-lab", "demo", "--scene", "street", "--seconds", "24", "--out", directory]
+    command = [f"{programs}/ecod-lab", "demo", "--scene", "street", "--seconds", "24", "--output", directory]
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     lines = queue.Queue()
     threading.Thread(target=lambda: [lines.put(line) for line in demo.stdout], daemon=True).start()

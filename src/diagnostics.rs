@@ -5,12 +5,16 @@
 //! trouble lasts. The register keeps a bounded number of entries, drops those that are over, and
 //! returns new troubles for the log. `docs/troubleshooting.md` lists all kinds.
 
+mod expected_nodes;
+
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::model::names::{MAX_NAME_BYTES, plain_text, vehicle_of};
 use crate::model::time::Timestamp;
 use crate::wire::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
+
+pub use expected_nodes::{ExpectedNodes, MISSING_TIMEOUT, MissingNode};
 
 /// Defines the kinds with their names on the wire, how long they count after they were last seen,
 /// and their remedies.
@@ -107,6 +111,8 @@ trouble_kinds! {
     CertificateEnds = "certificate_ends", UNTIL_SETTLED, "create a new one by `ecod-node pki issue`, and copy its two files here: no restart";
     /// A second running node of a name.
     NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
+    /// A former member that does not answer, and has neither left in order nor been dismissed.
+    NodeMissing = "node_missing", SHORT, "start it again; if it does not come back, `ecod-node cell dismiss` with its name ends this";
     /// An unanswered seed at a node that has discovered no other member.
     SeedSilent = "seed_silent", LONG, "start it, give both nodes the same `cell` and key, or let UDP through; without such a node, remove it from `membership.seeds`";
     /// A host name without an address.
@@ -154,6 +160,12 @@ impl TroubleKind {
     /// True if an aggregator with this trouble about a vehicle does not use the vehicle's reports.
     pub fn refuses_reports(self) -> bool {
         matches!(self, Self::Untimely | Self::Malformed | Self::NotPermitted)
+    }
+
+    /// True if a node's report of this trouble about another node is shown on the pages of all
+    /// nodes, because the others may lack the observation.
+    pub fn is_shared(self) -> bool {
+        self == Self::NodeMissing || self.is_separating()
     }
 
     /// True if a node with this trouble cannot do its work.
@@ -390,6 +402,15 @@ fn shortened(text: &str, max_bytes: usize) -> String {
         .map_or(&*cut, |(words, _)| words)
         .to_owned()
         + ELLIPSIS
+}
+
+/// A duration in words: whole seconds, minutes or hours.
+pub fn in_words(time: Duration) -> String {
+    match time.as_secs() {
+        seconds @ 0..120 => format!("{seconds} s"),
+        seconds @ 120..7200 => format!("{} min", seconds / 60),
+        seconds => format!("{} h", seconds / 3600),
+    }
 }
 
 /// A cause without its figures.

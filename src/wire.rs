@@ -40,6 +40,7 @@ mod trouble;
 mod validation;
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;
@@ -61,7 +62,7 @@ pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;
 pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
-pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
+pub use trouble::{MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
     InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER,
     MAX_SHARE_ENTRIES, Payload, check_fused_at,
@@ -443,6 +444,11 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(11)]
     pub page: Option<String>,
+    /// Absent nodes that are not expected to return: the node itself after an orderly stop, and
+    /// nodes that an operator has dismissed at this node.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(12), with = "skip_empty", has_nil)]
+    pub dismissed: Vec<NodeName>,
 }
 
 impl NodeStatus {
@@ -461,6 +467,7 @@ impl NodeStatus {
             description: None,
             troubles: Vec::new(),
             page: None,
+            dismissed: Vec::new(),
         }
     }
 }
@@ -481,6 +488,16 @@ pub enum Role {
     /// Always the preferred aggregator; has no camera.
     #[n(2)]
     Edge,
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Auto => "auto",
+            Self::Cav => "cav",
+            Self::Edge => "edge",
+        })
+    }
 }
 
 /// The current state of a node.

@@ -4,6 +4,7 @@
 mod calibrate;
 mod cell;
 mod doctor;
+mod installation;
 mod join;
 pub mod lines;
 mod logging;
@@ -16,10 +17,12 @@ mod reset;
 mod run;
 mod schema;
 mod shell;
+mod status;
 mod top;
 #[cfg(feature = "camera")]
 mod trial;
 
+use std::fmt;
 use std::io::{ErrorKind, Write};
 use std::process::ExitCode;
 
@@ -42,7 +45,7 @@ use run::RunArguments;
     version,
     args_conflicts_with_subcommands = true,
     arg_required_else_help = true,
-    after_long_help = logging::HELP
+    after_long_help = format!("{HELP}\n\n{}", logging::HELP)
 )]
 struct Cli {
     #[command(subcommand)]
@@ -53,39 +56,118 @@ struct Cli {
     log: LogArguments,
 }
 
+/// Examples, files and exit codes, printed by `ecod-node --help` and in the manual page.
+const HELP: &str = "\
+Examples:
+  ecod-node try                                   see it work with rendered cameras
+  sudo ecod-node init lot-1 edge --role edge      make a cell and its first node, which runs as a service
+  sudo ecod-node invite --role auto euclid        let the machine euclid join
+  ecod-node status                                state of this machine's node
+  ecod-node --role edge --name edge --cell lot-1  run a node without files
+
+Files:
+  /etc/ecod/node.toml  configuration of this machine's node; commands read it without --config
+  ecod/node.toml       the same of a node that was made without the rights of root
+  /etc/ecod/pki        CA of the cell, on the machine where `init` made it
+  /var/lib/ecod        state of the service
+
+Exit codes:
+  0  success, or ended by SIGINT or SIGTERM
+  1  could not start, gave up, or the command failed
+  2  unusable arguments or configuration
+  3  replay: unusable input
+  4  another running node of the cell has this node's name
+  5  status: the node is not ready
+  6  status: no node answers";
+
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Try it on your own video, images or camera: starts a cell with a page, without a
     /// configuration
+    #[command(after_long_help = "\
+Examples:
+  ecod-node try                       a rendered street
+  ecod-node try --video drive.mp4     your own video")]
     #[cfg(feature = "camera")]
     Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
+    #[command(after_long_help = "\
+Examples:
+  ecod-node doctor                      check this machine for its node
+  ecod-node doctor --json | jq .        the same for a program")]
     Doctor(doctor::DoctorArguments),
+    /// Print the state of this machine's node: readiness, leader, nodes and troubles. Ends with 0 if
+    /// it is ready, 5 if not, 6 if no node answers
+    #[command(after_long_help = "\
+Examples:
+  ecod-node status                       state of this machine's node
+  ecod-node status --json | jq .nodes    its nodes for a script
+  ecod-node status --watch               print the state at every change")]
+    Status(status::StatusArguments),
     /// Join a cell as an observer and show it in the terminal
+    #[command(after_long_help = "\
+Examples:
+  ecod-node top                                           the cell of this machine's node
+  ecod-node top --cell lot-1 --seed 192.168.1.10:17884    another cell without a key")]
     Top(top::TopArguments),
     /// Join a cell as an observer and record all its messages (MCAP)
+    #[command(after_long_help = "\
+Examples:
+  ecod-node record --dir log    record the cell of this machine's node until Ctrl-C")]
     Record(record::RecordArguments),
     /// Recompute maps and verdicts of a recording; equal input gives equal output
+    #[command(after_long_help = "\
+Examples:
+  ecod-node replay --input log/ --output rounds.jsonl
+  ecod-node replay --config cell.toml --input reports.jsonl --output -")]
     Replay(replay::ReplayArguments),
     /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
+    #[command(after_long_help = "\
+Examples:
+  ecod-node report log/ --output report.html")]
     Report(report::ReportArguments),
     /// Calibrate a camera from photographs of a chessboard
+    #[command(after_long_help = "\
+Examples:
+  ecod-node calibrate --columns 9 --rows 6 --square-mm 25 --output calibration.toml photographs/")]
     #[cfg(feature = "camera")]
     Calibrate(calibrate::CalibrateArguments),
     /// Make a cell and its first node on this machine: CA, key, certificate, configuration
+    #[command(after_long_help = "\
+Examples:
+  sudo ecod-node init lot-1 edge --role edge")]
     Init(join::InitArguments),
     /// Let other machines join the cell: prints a token for each, and waits for them
+    #[command(after_long_help = "\
+Examples:
+  sudo ecod-node invite --role auto euclid    a node that may take over the lead
+  sudo ecod-node invite gauss riemann         two vehicles")]
     Invite(join::InviteArguments),
     /// Join a cell by a token of `ecod-node invite`, which becomes this machine's node
+    #[command(after_long_help = "\
+Examples:
+  sudo ecod-node join TOKEN")]
     Join(join::JoinArguments),
     /// Make the certificates of a cell by hand: its CA, one per node, and the revocation list
+    #[command(after_long_help = "\
+Examples:
+  ecod-node pki issue viewer --role cav    a certificate for a program on another machine
+  ecod-node pki revoke gauss               the certificates of a stolen node")]
     #[command(subcommand)]
     Pki(pki::PkiCommand),
-    /// The settings that all nodes of a cell share: set, show, compare
+    /// The settings that all nodes of a cell share: set, show, compare; dismiss a missing node
+    #[command(after_long_help = "\
+Examples:
+  ecod-node cell set cell.toml     give the cell a description
+  ecod-node cell show              which node uses which version
+  ecod-node cell dismiss gauss     stop missing a node that is gone for good")]
     #[command(subcommand)]
     Cell(cell::CellCommand),
     /// Drop the evidence behind the reputations, the highest term, or the cell's description, of a
     /// node that is stopped
+    #[command(after_long_help = "\
+Examples:
+  ecod-node reset --reputations    while the node is stopped")]
     Reset(reset::ResetArguments),
     /// Print the JSON Schemas of every message
     Schema,
@@ -120,6 +202,12 @@ const NAME_TAKEN: u8 = 4;
 /// Exit code for input that is unusable or almost unusable.
 const REJECTED: u8 = 3;
 
+/// Exit code of `status` for a node that is not ready.
+const NOT_READY: u8 = 5;
+
+/// Exit code of `status` if no node answers.
+const NO_NODE: u8 = 6;
+
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
@@ -129,9 +217,9 @@ pub fn main() -> ExitCode {
 pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
-        Err(Failure { error, code }) => {
-            eprintln!("{program}: {error:#}");
-            ExitCode::from(code)
+        Err(failure) => {
+            eprintln!("{program}: {failure}");
+            ExitCode::from(failure.code)
         }
     }
 }
@@ -181,6 +269,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         #[cfg(feature = "camera")]
         Some(Command::Try(arguments)) => trial::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
+        Some(Command::Status(arguments)) => status::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),
         Some(Command::Replay(arguments)) => replay::run(&arguments),
@@ -212,6 +301,12 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:#}", self.error)
+    }
+}
+
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         Self { error, code: 1 }
@@ -232,6 +327,22 @@ impl Failure {
         Self {
             error: error.into(),
             code: USAGE,
+        }
+    }
+
+    /// A node that is not ready.
+    fn not_ready(error: anyhow::Error) -> Self {
+        Self {
+            error,
+            code: NOT_READY,
+        }
+    }
+
+    /// A node that does not answer.
+    fn no_node(error: anyhow::Error) -> Self {
+        Self {
+            error,
+            code: NO_NODE,
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! The checks leave the machine unchanged: they close the ports that they open, remove the files
 //! that they create, disconnect from the broker, and leave the cell, which they observe for some
-//! seconds. While the node itself runs, its ports are reported as in use.
+//! seconds. The ports of the node itself, if it runs, count as free.
 
 #[cfg(feature = "camera")]
 mod camera;
@@ -18,6 +18,7 @@ use ecod::diagnostics::TroubleKind;
 use serde::Serialize;
 
 use crate::node::config::NodeConfig;
+use crate::node::running::{RunningNode, RunningReadiness, page_address};
 
 /// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -80,17 +81,20 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     #[cfg(feature = "camera")]
     findings.extend(camera::examine(config).await);
     findings.extend(units(config));
-    findings.extend(network::broker(config).await);
+    let running = own_node(config).await;
+    let is_running = running.is_some();
+    findings.extend(running);
+    findings.extend(network::broker(config, is_running).await);
     findings.extend(network::uplink(config).await);
-    findings.push(network::gossip(config));
+    findings.push(network::gossip(config, is_running));
     findings.extend(network::seeds(config).await);
     findings.extend(cell::examine(config).await);
     #[cfg(feature = "camera")]
-    findings.extend(network::poses(config));
-    findings.extend(network::dashboard(config));
+    findings.extend(network::poses(config, is_running));
+    findings.extend(network::dashboard(config, is_running));
     findings.extend(storage::floor_plan(config));
     #[cfg(feature = "foxglove")]
-    findings.extend(network::live(config));
+    findings.extend(network::live(config, is_running));
     findings.extend(network::multicast(config));
     findings.push(storage::key(config));
     findings.extend(certificates::examine(config));
@@ -99,6 +103,22 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(storage::directories(config));
     findings.extend(storage::service(config, file));
     findings
+}
+
+/// The node of this configuration, if it runs on this machine.
+async fn own_node(config: &NodeConfig) -> Option<Finding> {
+    let asked = config.clone();
+    let read = move || RunningNode::read(page_address(&asked), &asked);
+    let node = tokio::task::spawn_blocking(read).await.ok()?.ok()?;
+    node.is_of(config).then(|| {
+        let (name, RunningReadiness { ready, reason }) = (&node.node.name, &node.readiness);
+        let seen = format!("{name} runs: {reason}");
+        if *ready {
+            Finding::fine("node", seen)
+        } else {
+            Finding::doubtful("node", seen, "`ecod-node status` names its troubles")
+        }
+    })
 }
 
 /// Checks that values look as if they had the units of their keys.

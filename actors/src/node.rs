@@ -27,9 +27,11 @@ mod builder;
 pub mod camera;
 pub mod config;
 pub(crate) mod description;
+pub(crate) mod health_log;
 mod presence;
 mod restarts;
 pub mod roaming;
+pub mod running;
 pub mod service;
 mod slots;
 
@@ -39,6 +41,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::diagnostics::in_words;
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
@@ -63,6 +66,7 @@ use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
 use builder::{NodeBuilder, cause};
 use description::HeldDescription;
+use health_log::HealthLog;
 pub use presence::MoveStep;
 use presence::{Presence, VehicleParts};
 use restarts::Restarts;
@@ -105,6 +109,7 @@ struct SupervisorState {
     builder: NodeBuilder,
     running: HashMap<ActorId, ActorKind>,
     restarts: Restarts,
+    health: HealthLog,
     manager: Option<ServiceManager>,
 }
 
@@ -256,6 +261,13 @@ impl NodeHandle {
         self.members.clone()
     }
 
+    /// The other nodes of the cell that answer, without observers.
+    pub fn other_nodes(&self) -> Vec<Member> {
+        let members = self.members.borrow();
+        let nodes = members.iter().filter(|member| !member.name.is_part());
+        nodes.cloned().collect()
+    }
+
     /// The cell's leadership, as it changes.
     pub fn leadership(&self) -> watch::Receiver<Leadership> {
         self.leadership.clone()
@@ -330,6 +342,7 @@ impl Actor for Supervisor {
             builder,
             running: HashMap::new(),
             restarts: Restarts::default(),
+            health: HealthLog::default(),
             manager: None,
         };
         for part in state.builder.parts() {
@@ -397,12 +410,15 @@ impl Actor for Supervisor {
         let Some(part) = state.running.remove(&actor.get_id()) else {
             return Ok(());
         };
-        tracing::warn!(?part, why, "part ended, starting it anew");
+        tracing::warn!(%part, why, "part ended, starting it anew");
         let restarted = if state.restarts.allow(clock::now()) {
             state.start(part, &myself.get_cell()).await
         } else {
-            Err(format!("parts ended more than {MAX_RESTARTS} times in {RESTART_SPAN:?}, the last: {part:?}: {why}")
-                .into())
+            Err(format!(
+                "parts ended more than {MAX_RESTARTS} times in {}, the last: {part}: {why}",
+                in_words(RESTART_SPAN)
+            )
+            .into())
         };
         restarted.inspect_err(|error| state.builder.give_up(NodeError::Failed(error.to_string())))
     }
@@ -422,11 +438,9 @@ impl Actor for Supervisor {
 }
 
 impl SupervisorState {
-    fn log_health(&self) {
-        let snapshot = self.builder.counters().snapshot();
-        let frames = self.builder.frames().snapshot();
-        let shed = self.builder.counters().all_shed();
-        tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?shed, ?frames, "health");
+    fn log_health(&mut self) {
+        let (counters, frames) = (self.builder.counters(), self.builder.frames());
+        self.health.log(&counters, &frames);
     }
 
     async fn start(

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use ecod::diagnostics::in_words;
 use ecod::leadership::Leadership;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
@@ -12,7 +13,7 @@ use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Style, Stylize};
 use ratatui::text::{Line, Span};
-use ratatui::widgets::{Block, Paragraph, Row, Table};
+use ratatui::widgets::{Block, Paragraph, Row, Table, Wrap};
 
 use crate::messages::newest::{Received, ReceivedMap};
 use crate::node::NodeHandle;
@@ -50,6 +51,8 @@ pub struct CellView {
     pub reputations: Option<Received<Reputations>>,
     /// Current troubles of the cell, with the node that reports each.
     pub troubles: Vec<(Option<NodeName>, Trouble)>,
+    /// How vehicles begin to report, for a cell without reports.
+    pub guide: String,
     /// The observer's counters.
     pub counters: CounterSnapshot,
     /// Number of lines above the first visible one.
@@ -73,11 +76,12 @@ impl CellView {
             now,
             leadership: node.leadership().borrow().clone(),
             history,
-            members: node.members().borrow().clone(),
+            members: node.other_nodes(),
             map: node.newest_map().borrow().clone(),
             verdicts: node.newest_verdicts().borrow().clone(),
             reputations: node.newest_reputations().borrow().clone(),
             troubles: node.troubles(),
+            guide: config.reporting(None),
             counters: node.counters().snapshot(),
             scroll,
         };
@@ -128,7 +132,11 @@ pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     let table = locations(view, places.height);
     frame.render_widget(summary(view), head);
     frame.render_widget(troubles(view), wrong);
-    frame.render_widget(table, places);
+    if location_rows(view).is_empty() {
+        frame.render_widget(guide(view), places);
+    } else {
+        frame.render_widget(table, places);
+    }
     frame.render_widget(vehicles(view), nodes);
     frame.render_widget(counted(view), losses);
     frame.render_widget(Line::from(" q: quit, arrow keys: scroll").dim(), foot);
@@ -139,7 +147,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         (Some(leader), Some(epoch)) => {
             let since = view.history.back().filter(|(newest, _)| newest == epoch);
             let since = since.map_or_else(String::new, |(_, at)| {
-                format!(", seen for {}", span(view.now.since(*at)))
+                format!(", seen for {}", in_words(view.now.since(*at)))
             });
             let standby = view
                 .leadership
@@ -159,7 +167,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         .map(|(_, received_at)| view.now.since(received_at))
     {
         Some(age) if view.patience.is_some_and(|patience| age > patience) => {
-            Span::from(format!("STALE: no round for {}", span(age)))
+            Span::from(format!("STALE: no round for {}", in_words(age)))
                 .bold()
                 .red()
         }
@@ -232,6 +240,13 @@ fn locations(view: &mut CellView, height: u16) -> Table<'static> {
     Table::new(rows.into_iter().skip(first).take(room), widths)
         .header(head)
         .block(Block::bordered().title(title))
+}
+
+/// The next step of a user whose cell has no reports.
+fn guide(view: &CellView) -> Paragraph<'_> {
+    Paragraph::new(view.guide.as_str())
+        .wrap(Wrap { trim: true })
+        .block(Block::bordered().title(" what is where "))
 }
 
 fn location_rows(view: &CellView) -> Vec<Row<'static>> {
@@ -327,7 +342,7 @@ fn vehicles(view: &CellView) -> Table<'_> {
         };
         Row::new([
             member.name.to_string(),
-            format!("{:?}", member.role).to_lowercase(),
+            member.role.to_string(),
             part.to_owned(),
             trusted(&member.name),
         ])
@@ -400,14 +415,6 @@ fn counted(view: &CellView) -> Table<'_> {
         .block(Block::bordered().title(title))
 }
 
-fn span(time: Duration) -> String {
-    match time.as_secs() {
-        seconds @ 0..120 => format!("{seconds} s"),
-        seconds @ 120..7200 => format!("{} min", seconds / 60),
-        seconds => format!("{} h", seconds / 3600),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
@@ -463,6 +470,7 @@ mod tests {
                 is_yielding: false,
             },
             history: [(Epoch::new(3, name("edge")), Timestamp(0))].into(),
+            guide: "no vehicle reports yet: run this".into(),
             members: vec![Member {
                 name: name("gauss"),
                 run: 0,
@@ -641,5 +649,20 @@ mod tests {
         for (width, height) in [(1, 1), (20, 5), (40, 12)] {
             shown(&mut view(Timestamp(0)), width, height);
         }
+    }
+
+    #[test]
+    fn a_cell_without_reports_is_told_the_next_step() {
+        let now = Timestamp(0) + Duration::from_secs(9);
+        let mut view = CellView {
+            map: None,
+            verdicts: None,
+            ..view(now)
+        };
+        let shown = shown(&mut view, 80, 30);
+        assert!(
+            shown.contains("no vehicle reports yet: run this"),
+            "{shown}"
+        );
     }
 }

@@ -196,7 +196,7 @@ fn eval(program: &Path, recording: &Recording, input: &Path) -> anyhow::Result<V
     eval.args(["eval", "--format", format, "--frame-rate", frame_rate])
         .arg("--truth")
         .arg(truth);
-    run(eval.arg("--input").arg(input).arg("--out").arg(&result))?;
+    run(eval.arg("--input").arg(input).arg("--output").arg(&result))?;
     let result: Value = serde_json::from_slice(&fs::read(&result)?)?;
     Ok(result["tracks"].clone())
 }

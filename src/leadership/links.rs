@@ -4,6 +4,7 @@
 //! publishes on its own broker and on the standby's. A link outlives its use by [`LINK_LINGER`].
 
 use std::collections::BTreeSet;
+use std::fmt;
 
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::timers::LINK_LINGER;
@@ -31,6 +32,17 @@ pub enum LinkState {
     Down,
     /// Not connected because the port is closed: the broker's process has ended. Attempts continue.
     Refused,
+}
+
+impl fmt::Display for LinkState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Up => "up",
+            Self::Stalled => "stalled",
+            Self::Down => "down",
+            Self::Refused => "refused",
+        })
+    }
 }
 
 /// The brokers of leader and standby, and the node's own.

@@ -288,10 +288,19 @@ impl LeadershipNode {
                     self.feed(ElectionInput::Greet, now);
                 }
             }
-            Input::Telling { troubles, page } => {
-                self.is_status_told &=
-                    (&self.status.troubles, &self.status.page) == (&troubles, &page);
-                (self.status.troubles, self.status.page) = (troubles, page);
+            Input::Telling {
+                troubles,
+                page,
+                dismissed,
+            } => {
+                let status = NodeStatus {
+                    troubles,
+                    page,
+                    dismissed,
+                    ..self.status.clone()
+                };
+                self.is_status_told &= status == self.status;
+                self.status = status;
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }

@@ -1,5 +1,7 @@
 //! The view of leadership that all parts of a node work with.
 
+use std::fmt;
+
 use serde::Serialize;
 
 use crate::leadership::election::Election;
@@ -38,6 +40,17 @@ pub enum Position {
     StandingBy,
     /// It leads.
     Leading,
+}
+
+impl fmt::Display for Position {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Seeking => "seeking",
+            Self::Following => "following",
+            Self::StandingBy => "standing_by",
+            Self::Leading => "leading",
+        })
+    }
 }
 
 impl Leadership {

@@ -59,15 +59,19 @@ impl NodeName {
         &self.0
     }
 
+    /// True if the name belongs to a part of a node, such as a program or an observer beside it.
+    pub fn is_part(&self) -> bool {
+        vehicle_of(&self.0).len() != self.0.len()
+    }
+
     /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the
     /// name itself.
     #[must_use]
     pub fn vehicle(&self) -> Self {
-        let vehicle = vehicle_of(&self.0);
-        if vehicle.len() == self.0.len() {
-            self.clone()
+        if self.is_part() {
+            Self(SmolStr::new(vehicle_of(&self.0)))
         } else {
-            Self(SmolStr::new(vehicle))
+            self.clone()
         }
     }
 }

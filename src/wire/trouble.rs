@@ -25,5 +25,8 @@ pub struct Trouble {
 /// Maximum number of troubles in a status.
 pub const MAX_TROUBLES: usize = 16;
 
+/// Maximum number of dismissed nodes in a status.
+pub const MAX_DISMISSED: usize = 16;
+
 /// Maximum length of a cause or remedy in bytes.
 pub const MAX_TROUBLE_TEXT: usize = 300;

@@ -10,9 +10,9 @@ use serde::de::DeserializeOwned;
 use super::codec;
 use super::{
     CellDescription, CellMap, CellReputation, Encoding, FieldOfView, FusedObject, GlobalMap,
-    LandmarkState, LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport,
-    PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION,
-    Trouble, Verdict, Verdicts,
+    LandmarkState, LedgerShare, MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus,
+    ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations,
+    SCHEMA_VERSION, Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
@@ -488,7 +488,7 @@ fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
             return Err(RejectReason::InvalidLabel);
         }
     }
-    if status.troubles.len() > MAX_TROUBLES {
+    if status.troubles.len() > MAX_TROUBLES || status.dismissed.len() > MAX_DISMISSED {
         return Err(RejectReason::TooManyObjects);
     }
     status.troubles.iter().try_for_each(check_trouble)?;

@@ -301,6 +301,7 @@ fn node_status() {
                 remedy: "synchronise it by NTP".into(),
             }],
             page: Some("http://192.0.2.1:8080/".into()),
+            dismissed: vec![name("riemann")],
         },
     );
 }

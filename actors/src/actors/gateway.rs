@@ -189,6 +189,7 @@ impl Actor for Gateway {
         let gone = NodeStatus {
             state: NodeState::Offline,
             troubles: Vec::new(),
+            dismissed: vec![state.status.node.clone()],
             ..state.status.clone()
         };
         state.set_status(gone);
@@ -501,7 +502,7 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 /// Delivers the new state of a link to this node's actors.
 fn tell_state(inbox: &Inbox, link: &Link) {
     let (broker, state) = (link.broker.clone(), link.state);
-    tracing::info!(%broker, ?state, "link changed");
+    tracing::info!(%broker, %state, "link changed");
     inbox.deliver_link(
         Via {
             address: &broker,

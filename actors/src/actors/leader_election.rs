@@ -39,6 +39,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
+use crate::observe::dashboard::LiveState;
 use crate::observe::readiness::SharedFacts;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
@@ -98,6 +99,8 @@ pub struct LeaderElectionArguments {
     pub credentials: Option<Arc<Credentials>>,
     /// The node's counters.
     pub counters: Arc<Counters>,
+    /// The expected nodes of the cell.
+    pub live_state: Arc<LiveState>,
 }
 
 /// Drives a [`LeadershipNode`](ecod::leadership::node::LeadershipNode).

@@ -20,8 +20,14 @@ pub(super) struct CalibrateArguments {
     #[command(flatten)]
     board: BoardArguments,
     /// Calibration file to write
-    #[arg(long, value_name = "FILE", default_value = "calibration.toml")]
-    out: PathBuf,
+    #[arg(
+        short,
+        long,
+        alias = "out",
+        value_name = "FILE",
+        default_value = "calibration.toml"
+    )]
+    output: PathBuf,
     /// Photographs, or directories of photographs
     #[arg(required = true, value_name = "IMAGE")]
     images: Vec<PathBuf>,
@@ -53,7 +59,7 @@ pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
     let CalibrateArguments {
         part,
         board,
-        out,
+        output,
         images,
     } = arguments;
     if let Some(CalibrateCommand::Mount(command)) = part {
@@ -74,9 +80,9 @@ pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
         eprintln!("the whole board was not found in {}", image.display());
     }
     let found = &report.calibration;
-    found.write(out).context("cannot calibrate")?;
-    let (out, rms_px, photographs) = (out.display(), found.rms_px, found.images.len());
+    found.write(output).context("cannot calibrate")?;
+    let (file, rms_px, photographs) = (output.display(), found.rms_px, found.images.len());
     Ok(print(&format!(
-        "{out}: {rms_px:.3} px rms over {photographs} photographs\n"
+        "{file}: {rms_px:.3} px rms over {photographs} photographs\n"
     ))?)
 }

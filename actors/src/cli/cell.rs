@@ -1,5 +1,5 @@
-//! `ecod-node cell`: the settings that all nodes of a cell share, through the local broker of one
-//! of them.
+//! `ecod-node cell`: the settings that all nodes of a cell share, and the dismissal of missing
+//! nodes, through the local broker of one node.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
+use bytes::Bytes;
 use clap::{Args, Subcommand};
 use ecod::description::DescriptionHistory;
 use ecod::leadership::BrokerAddress;
@@ -18,7 +19,7 @@ use ecod::wire::{MAX_DESCRIPTION_BYTES, decode, encode};
 use serde_json::{Map, Value, json};
 use uuid::Uuid;
 
-use super::{Failure, print};
+use super::{Failure, installation, print};
 use crate::node::config::{NodeConfig, SharedConfig};
 use crate::node::description::description_file;
 use crate::platform::bounded_file;
@@ -46,6 +47,13 @@ pub(super) enum CellCommand {
         #[command(flatten)]
         door: DoorArguments,
     },
+    /// Stop expecting a node that is gone for good, so that no node reports it as missing
+    Dismiss {
+        /// Name of the missing node
+        node: NodeName,
+        #[command(flatten)]
+        door: DoorArguments,
+    },
     /// Compare a file with the description that the cell has; ends with 1 if they differ
     Diff {
         /// The description (TOML)
@@ -58,7 +66,8 @@ pub(super) enum CellCommand {
 /// Flags that name a node of this machine.
 #[derive(Debug, Args)]
 pub(super) struct DoorArguments {
-    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
+    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node [default,
+    /// without --cell and --door: /etc/ecod/node.toml or ecod/node.toml, if it exists]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Name of the cell
@@ -68,9 +77,6 @@ pub(super) struct DoorArguments {
     #[arg(long, value_name = "IP:PORT")]
     door: Option<SocketAddr>,
 }
-
-/// Configuration of the machine's node, if it was made by `init`, `join` or the package.
-const SERVICE_CONFIGURATION: &str = "/etc/ecod/node.toml";
 
 /// Maximum time for the node's answer.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -98,6 +104,10 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
             set(client, &text).await
         }
         CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
+        CellCommand::Dismiss { node, door } => {
+            DoorClient::open(door).await?.dismiss(node).await?;
+            Ok(print(&format!("{node} is not expected any more\n"))?)
+        }
         CellCommand::Diff { file, door } => {
             let text = read(file)?;
             let described = DoorClient::open(door).await?.present().await?;
@@ -189,8 +199,13 @@ impl DoorClient {
                 .as_ref()
                 .map(|cell| ("cell".to_owned(), json!(cell))),
         );
-        let mut config =
-            NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
+        let given = arguments.config.as_deref();
+        let file = if arguments.cell.is_none() && arguments.door.is_none() {
+            installation::configuration(given)
+        } else {
+            given.map(Path::to_owned)
+        };
+        let mut config = NodeConfig::load(file.as_deref(), &flags).map_err(Failure::usage)?;
         // Version 5 has reasons for refusals; the local broker requires no password.
         config.mqtt.version = MqttVersion::V5;
         (config.mqtt.user, config.mqtt.password) = (None, None);
@@ -220,14 +235,7 @@ impl DoorClient {
         };
         let accepted = door.connection.next(PATIENCE).await;
         accepted.with_context(|| {
-            let unread = arguments.config.is_none() && Path::new(SERVICE_CONFIGURATION).exists();
-            let remedy = match unread {
-                true => {
-                    format!("`--config {SERVICE_CONFIGURATION}` reads that of this machine's node")
-                }
-                false => "`--door` names another address of it".to_owned(),
-            };
-            format!("no node at {address}: it must run on this machine; {remedy}")
+            format!("no node at {address}: it must run on this machine; `--door` names another address of it")
         })?;
         let filters = [
             door.topics.path(&Topic::Cell),
@@ -316,6 +324,21 @@ impl DoorClient {
             let description = self.present().await?;
             if description.version > 0 && description.text == request.text {
                 return Ok(description);
+            }
+        }
+    }
+
+    /// Dismisses a missing node; returns when the connected node has confirmed it.
+    async fn dismiss(&mut self, node: &NodeName) -> Result<(), anyhow::Error> {
+        self.present().await?;
+        let topic = self.topics.path(&Topic::Nodes(node.clone()));
+        self.client
+            .publish(&topic, &Bytes::new(), Retention::Acknowledged);
+        loop {
+            if let DoorMessage::Status(status) = self.expect().await?
+                && status.dismissed.contains(node)
+            {
+                return Ok(());
             }
         }
     }

@@ -1,22 +1,19 @@
 //! `ecod-node doctor`: checks whether a node can run here.
 
-use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
 
+use super::installation::ConfigurationArguments;
 use super::{Failure, print};
 use crate::doctor::{CheckResult, Finding, examine};
-use crate::node::config::NodeConfig;
 
 /// Flags of `doctor`.
 #[derive(Debug, Args)]
 pub(super) struct DoctorArguments {
-    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
-    #[arg(long, value_name = "FILE")]
-    config: PathBuf,
+    #[command(flatten)]
+    configuration: ConfigurationArguments,
     /// Print JSON for programs
     #[arg(long)]
     json: bool,
@@ -24,10 +21,9 @@ pub(super) struct DoctorArguments {
 
 /// Prints one line per check; fails if one is broken.
 pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
-    let config = NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new())
-        .map_err(Failure::usage)?;
+    let (config, file) = arguments.configuration.load()?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
-    let findings = runtime.block_on(examine(&config, &arguments.config));
+    let findings = runtime.block_on(examine(&config, &file));
     // A camera may block forever.
     runtime.shutdown_timeout(Duration::ZERO);
     if arguments.json {

@@ -1,15 +1,22 @@
 //! Format and destination of the program's log, and the export of its spans.
 
+use std::fmt;
 use std::io::{IsTerminal, stderr};
 use std::os::unix::fs::MetadataExt;
 
 use clap::ValueEnum;
+use serde_json::{Map, Value};
 use tracing::level_filters::LevelFilter;
+use tracing::{Event, Subscriber};
 use tracing_subscriber::filter::{FilterExt, filter_fn};
+use tracing_subscriber::fmt::format::{JsonFields, Writer};
+use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields, MakeWriter, format};
 use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry};
 
+use crate::node::health_log;
 use crate::telemetry::line_throttle::LineThrottle;
 #[cfg(feature = "otel")]
 use crate::telemetry::otlp::Export;
@@ -146,14 +153,82 @@ fn text() -> AnyLayer {
 }
 
 fn json() -> AnyLayer {
+    json_to(stderr)
+}
+
+fn json_to(output: impl for<'a> MakeWriter<'a> + Send + Sync + 'static) -> AnyLayer {
     tracing_subscriber::fmt::layer()
-        .json()
-        .flatten_event(true)
-        .with_writer(stderr)
+        .event_format(NestedHealth(format().json().flatten_event(true)))
+        .fmt_fields(JsonFields::new())
+        .with_writer(output)
         .boxed()
+}
+
+/// A format of JSON lines whose counters are objects in the line about a node's health.
+struct NestedHealth<F>(F);
+
+impl<S, N, F> FormatEvent<S, N> for NestedHealth<F>
+where
+    S: Subscriber + for<'a> LookupSpan<'a>,
+    N: for<'a> FormatFields<'a> + 'static,
+    F: FormatEvent<S, N>,
+{
+    fn format_event(
+        &self,
+        context: &FmtContext<'_, S, N>,
+        mut writer: Writer<'_>,
+        event: &Event<'_>,
+    ) -> fmt::Result {
+        if event.metadata().target() != health_log::TARGET {
+            return self.0.format_event(context, writer, event);
+        }
+        let mut line = String::new();
+        self.0
+            .format_event(context, Writer::new(&mut line), event)?;
+        let Ok(mut fields) = serde_json::from_str::<Map<String, Value>>(&line) else {
+            return writer.write_str(&line);
+        };
+        for field in fields.values_mut() {
+            if let Some(counts) = field
+                .as_str()
+                .and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok())
+            {
+                *field = Value::Object(counts);
+            }
+        }
+        writeln!(writer, "{}", Value::Object(fields))
+    }
 }
 
 fn journal() -> std::io::Result<AnyLayer> {
     let layer = tracing_journald::layer()?.with_field_prefix(Some(JOURNAL_PREFIX.into()));
     Ok(layer.with_syslog_identifier("ecod-node".into()).boxed())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use super::*;
+
+    #[test]
+    fn the_counters_of_a_health_line_are_objects_in_json() {
+        let output = Arc::new(Mutex::new(Vec::new()));
+        let subscriber = tracing_subscriber::registry().with(json_to(Arc::clone(&output)));
+        tracing::subscriber::with_default(subscriber, || {
+            let counts = r#"{"published":3}"#;
+            tracing::info!(target: health_log::TARGET, events = %counts, "health");
+            tracing::info!(text = %counts, "other");
+        });
+        let output = output.lock().unwrap();
+        let lines: Vec<Value> = serde_json::Deserializer::from_slice(&output)
+            .into_iter()
+            .map(Result::unwrap)
+            .collect();
+        assert_eq!(
+            (&lines[0]["message"], &lines[0]["events"]["published"]),
+            (&"health".into(), &3.into())
+        );
+        assert_eq!(lines[1]["text"], r#"{"published":3}"#, "only that line");
+    }
 }

@@ -11,6 +11,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
+use super::installation::{self, AUTHORITY_DIRECTORY};
 use super::{Failure, print};
 use crate::platform::clock;
 use crate::transport::pki::{Authority, DEFAULT_DAYS};
@@ -105,9 +106,10 @@ pub(super) struct CityDir {
 
 #[derive(Debug, Args)]
 pub(super) struct AuthorityDir {
-    /// Directory of the CA; anyone who can read its `ca.key` can issue certificates
-    #[arg(long, value_name = "DIR", default_value = "pki")]
-    dir: PathBuf,
+    /// Directory of the CA; anyone who can read its `ca.key` can issue certificates [default: pki,
+    /// or the CA that `ecod-node init` has made on this machine]
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
 }
 
 /// Runs the command and prints the files to distribute.
@@ -115,11 +117,12 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
     let now = clock::now();
     let message = match command {
         PkiCommand::Init { ca, cell, city } => {
+            let directory = ca.dir.as_deref().unwrap_or(Path::new(AUTHORITY_DIRECTORY));
             let authority = match city {
                 Some(city) => {
-                    Authority::open(city).and_then(|mut city| city.init_cell(&ca.dir, cell, now))
+                    Authority::open(city).and_then(|mut city| city.init_cell(directory, cell, now))
                 }
-                None => Authority::init(&ca.dir, cell, now),
+                None => Authority::init(directory, cell, now),
             };
             let authority = authority.map_err(failure)?;
             format!(
@@ -135,7 +138,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
             operator,
             days,
         } => {
-            let mut authority = open(&ca.dir, false)?;
+            let mut authority = open(&installation::authority(ca.dir.as_deref()), false)?;
             let rights = Rights {
                 role: role_named(role),
                 priority: *priority,
@@ -147,7 +150,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
             configuration(&authority, node)
         }
         PkiCommand::Revoke { ca, node } => {
-            let mut authority = open(&ca.dir, false)?;
+            let mut authority = open(&installation::authority(ca.dir.as_deref()), false)?;
             let count = authority.revoke(node, now).map_err(failure)?;
             let list = shown(&authority.revocation_list());
             format!(

@@ -35,7 +35,7 @@ pub(super) struct ReplayArguments {
     #[command(flatten)]
     node: LogsNodeArguments,
     /// File for maps and verdicts, one JSON object per line; `-` for standard output
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Weigh all recorded votes together N times, and write the last verdicts only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]

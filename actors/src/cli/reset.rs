@@ -1,14 +1,11 @@
 //! `ecod-node reset`: drops the evidence about vehicles, the highest term, or the description.
 
-use std::collections::BTreeMap;
-use std::path::PathBuf;
-
 use anyhow::{Context, anyhow};
 use clap::{ArgGroup, Args};
 
+use super::installation::ConfigurationArguments;
 use super::{Failure, print};
 use crate::actors::reputation_keeper::reset_saved;
-use crate::node::config::NodeConfig;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 
@@ -16,9 +13,8 @@ use crate::platform::state_file::StateFile;
 #[derive(Debug, Args)]
 #[command(group(ArgGroup::new("what").required(true).multiple(true)))]
 pub(super) struct ResetArguments {
-    /// Configuration of the node (TOML); `ECOD_…` variables apply as they do to the node
-    #[arg(long, value_name = "FILE")]
-    config: PathBuf,
+    #[command(flatten)]
+    configuration: ConfigurationArguments,
     /// Drop the evidence behind the reputations. In a cell without certificates all nodes drop it
     #[arg(long, group = "what")]
     reputations: bool,
@@ -32,8 +28,7 @@ pub(super) struct ResetArguments {
 
 /// Resets the files; the node must not run.
 pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
-    let config = NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new())
-        .map_err(Failure::usage)?;
+    let (config, _) = arguments.configuration.load()?;
     let missing = |key: &str, what: &str| Failure::usage(anyhow!("key `{key}`: {what}"));
     let directory = config
         .state_dir

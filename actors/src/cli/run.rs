@@ -15,9 +15,10 @@ use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use serde_json::{Value, json};
 use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
+use tokio::time::timeout;
 
-use super::{Failure, print};
+use super::{Failure, installation, print};
 #[cfg(feature = "camera")]
 use crate::camera::frame_source::capture::Readers;
 use crate::node::NodeError;
@@ -27,7 +28,6 @@ use crate::node::service::ServiceManager;
 #[cfg(feature = "camera")]
 use crate::platform::installed;
 use crate::transport::mqtt::BrokerAddress;
-use crate::transport::pki::OBSERVER_MARK;
 
 /// Flags of a node; each overrides the key of its name in the configuration file.
 #[derive(Debug, Default, Args)]
@@ -123,7 +123,7 @@ fn continue_without_opencv() {
         let error = Command::new(&program)
             .args(std::env::args_os().skip(1))
             .exec();
-        tracing::warn!(?program, %error, "cannot run the program without OpenCV; this one goes on, with more memory");
+        tracing::warn!(program = %program.display(), %error, "cannot run the program without OpenCV; this one goes on, with more memory");
     }
 }
 
@@ -201,6 +201,9 @@ fn remove_nulls(value: &mut Value) {
     }
 }
 
+/// Maximum time for the page to be served before the node names its address.
+const PAGE_TIMEOUT: Duration = Duration::from_secs(2);
+
 /// Maximum time for the threads of a stopped node to end.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -223,7 +226,12 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
             "environment variables that begin with ECOD_ but name no key are left out"
         );
     }
+    let announced = (!config.looks_on()).then(|| config.clone());
     let mut vehicle = Roamer::start(config).await?;
+    if let Some(config) = announced {
+        let page = vehicle.present().dashboard_address();
+        tokio::spawn(async move { announce(&config, page).await });
+    }
     if let Some(manager) = ServiceManager::from_environment() {
         vehicle.present().report_to(manager);
     }
@@ -236,6 +244,29 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     tracing::info!("stopping");
     vehicle.stop().await;
     Ok(())
+}
+
+/// Logs what runs, where its page is, and what a user can do next, once the page is served.
+async fn announce(config: &NodeConfig, mut page: watch::Receiver<Option<SocketAddr>>) {
+    let bound = async {
+        let bound = timeout(PAGE_TIMEOUT, page.wait_for(Option::is_some)).await;
+        *bound.ok()?.ok()?
+    };
+    let is_enabled = config.dashboard.enabled;
+    let page = if is_enabled { bound.await } else { None };
+    let name = config.name.as_ref().map_or("node", NodeName::as_str);
+    let (role, cell, version) = (config.role, &config.cell, env!("CARGO_PKG_VERSION"));
+    tracing::info!("{name} ({role}) of cell {cell} runs, version {version}");
+    match page {
+        Some(page) if config.dashboard.token.is_some() => {
+            tracing::info!("page: http://{page}/?token= and the token");
+        }
+        Some(page) => tracing::info!("page: http://{page}/"),
+        None if is_enabled => tracing::info!("no page yet: its address is in use"),
+        None => tracing::info!("no page: `dashboard.enabled` is false"),
+    }
+    let joining = config.joining();
+    tracing::info!("next: `ecod-node status` shows the cell; {joining}");
 }
 
 /// Flags of a program that joins a cell as an observer. The configuration may belong to any node of
@@ -252,48 +283,21 @@ impl ObserverArguments {
         self.join.name.as_ref()
     }
 
-    /// Configuration of a node that only observes: it cannot lead, has no camera, keeps no state,
-    /// and does not use the addresses in the file. Its default name is made of `purpose` and the
-    /// process id.
+    /// Configuration of a node that only observes, by default of the installed node: it cannot lead,
+    /// has no camera, keeps no state,
+    /// and does not use the addresses in the file. Its name is made of the node's name, `purpose`
+    /// and the process id.
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
-        let default_name = format!("{purpose}-{}", std::process::id());
-        let name = self
-            .join
-            .name
-            .clone()
-            .or_else(|| NodeName::new(&default_name).ok());
-        let join = SeedArguments {
-            name,
-            ..self.join.clone()
-        };
-        let mut config = RunArguments {
-            role: Some("cav".into()),
+        let mut join = self.join.clone();
+        // Flags that name another cell leave out the installed node, with its key and certificate.
+        if join.cell.is_none() && join.broker.is_none() && join.seeds.is_empty() {
+            join.config = installation::configuration(join.config.as_deref());
+        }
+        let arguments = RunArguments {
             join,
             ..RunArguments::default()
-        }
-        .load()?;
-        // With a node's certificate, the observer needs a name below that node's.
-        if config.tls.is_some() && self.join.name.is_none() {
-            let SeedArguments {
-                config: file, cell, ..
-            } = self.join.clone();
-            let join = SeedArguments {
-                config: file,
-                cell,
-                ..SeedArguments::default()
-            };
-            if let Some(holder) = (RunArguments {
-                join,
-                ..RunArguments::default()
-            })
-            .load()?
-            .name
-            {
-                let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{default_name}"));
-                config.name = Some(name.map_err(Failure::usage)?);
-            }
-        }
-        Ok(config.without_own_addresses())
+        };
+        arguments.load()?.observing(purpose).map_err(Failure::usage)
     }
 }
 
@@ -338,6 +342,12 @@ mod tests {
         };
         assert!(!config.dashboard.enabled && !config.has_broker());
         assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));
-        assert!(config.name.unwrap().as_str().starts_with("recorder-"));
+        assert!(
+            config
+                .name
+                .unwrap()
+                .as_str()
+                .starts_with("euclid--recorder-")
+        );
     }
 }

@@ -46,8 +46,8 @@ pub(super) struct TryArguments {
     url: Vec<String>,
     /// Write the configuration that is used; the files of further vehicles are numbered, as in
     /// node-2.toml
-    #[arg(long, value_name = "FILE")]
-    save: Option<PathBuf>,
+    #[arg(short, long, alias = "save", value_name = "FILE")]
+    output: Option<PathBuf>,
     /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in
     /// use
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
@@ -75,7 +75,7 @@ pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
     run_to_end(serve(
         configs,
-        arguments.save.as_deref(),
+        arguments.output.as_deref(),
         arguments.stop_at_eof,
     ))
 }
@@ -153,7 +153,7 @@ impl TryArguments {
             configs = street().map_err(Failure::usage)?;
         }
         for (index, config) in configs.iter_mut().enumerate() {
-            if let Some(path) = &self.save {
+            if let Some(path) = &self.output {
                 check_absent(&numbered(path, index)).map_err(Failure::usage)?;
             }
             apart(config);
@@ -177,7 +177,7 @@ fn check_absent(path: &Path) -> anyhow::Result<()> {
     );
     ensure!(
         !path.exists(),
-        "cannot write {}: it exists, choose another name for --save",
+        "cannot write {}: it exists, choose another name for --output",
         path.display()
     );
     Ok(())

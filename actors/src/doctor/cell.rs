@@ -29,7 +29,11 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     if membership.seeds.is_empty() && !membership.multicast.enabled {
         return Vec::new();
     }
-    let observer = match config.clone().observing("doctor") {
+    let unrecorded = NodeConfig {
+        record: None,
+        ..config.clone()
+    };
+    let observer = match unrecorded.observing("doctor") {
         Ok(observer) => observer,
         Err(error) => return vec![Finding::broken("cell", error.to_string(), "shorten `name`")],
     };
@@ -56,7 +60,7 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
 }
 
 fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
-    let (cell, nodes) = (&config.cell, node.members().borrow().len());
+    let (cell, nodes) = (&config.cell, node.other_nodes().len());
     let leader = node.leadership().borrow().leader().map(NodeName::to_string);
     let fix = "start another node, or check that `cell` and the key are the same on all, `membership.seeds`, and that UDP 17884 \
         passes; the first node of a cell is alone";

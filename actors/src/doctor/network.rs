@@ -20,7 +20,7 @@ const MULTICAST_TIMEOUT: Duration = Duration::from_millis(500);
 const LOOKUP_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Checks the connection to the external broker and the port of the embedded one.
-pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
+pub(super) async fn broker(config: &NodeConfig, is_running: bool) -> Vec<Finding> {
     let mut findings = Vec::new();
     let plane = config.data_plane();
     if let Some(address) = &plane.external {
@@ -43,6 +43,7 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
             check: "broker port",
             address: config.broker_listen(),
             key: "listen",
+            is_running,
         };
         let bound = TcpListener::bind(port.address);
         let free_one_will_do = config.may_listen_at_any_port();
@@ -93,7 +94,7 @@ pub(super) async fn uplink(config: &NodeConfig) -> Option<Finding> {
 }
 
 /// Checks the gossip port.
-pub(super) fn gossip(config: &NodeConfig) -> Finding {
+pub(super) fn gossip(config: &NodeConfig, is_running: bool) -> Finding {
     let membership = &config.membership;
     let ip = if membership.has_key() {
         [0, 0, 0, 0]
@@ -107,6 +108,7 @@ pub(super) fn gossip(config: &NodeConfig) -> Finding {
         check: "gossip port",
         address,
         key: "membership.bind",
+        is_running,
     };
     let bound = UdpSocket::bind(address);
     if membership.bind.is_some() {
@@ -143,22 +145,24 @@ pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
 
 /// Checks the port that receives the poses of a moving vehicle.
 #[cfg(feature = "camera")]
-pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
+pub(super) fn poses(config: &NodeConfig, is_running: bool) -> Option<Finding> {
     let port = Port {
         check: "pose port",
         address: config.pose.listen?,
         key: "pose.listen",
+        is_running,
     };
     Some(port.of(UdpSocket::bind(port.address)))
 }
 
 /// Checks the address of the dashboard, unless it is disabled.
-pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
+pub(super) fn dashboard(config: &NodeConfig, is_running: bool) -> Option<Finding> {
     let listen = config.dashboard.listen;
     let port = Port {
         check: "dashboard",
         address: listen.unwrap_or(DEFAULT_ADDRESS),
         key: "dashboard.listen",
+        is_running,
     };
     config.dashboard.enabled.then(|| {
         let bound = TcpListener::bind(port.address);
@@ -172,12 +176,13 @@ pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
 
 /// Checks the port of the live log server, if configured.
 #[cfg(feature = "foxglove")]
-pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
+pub(super) fn live(config: &NodeConfig, is_running: bool) -> Option<Finding> {
     let port = config.record.as_ref().and_then(|record| record.live_port)?;
     let port = Port {
         check: "live port",
         address: SocketAddr::from(([127, 0, 0, 1], port)),
         key: "record.live_port",
+        is_running,
     };
     Some(port.of(TcpListener::bind(port.address)))
 }
@@ -188,6 +193,8 @@ struct Port {
     check: &'static str,
     address: SocketAddr,
     key: &'static str,
+    /// True if the node itself runs, so that it has the port.
+    is_running: bool,
 }
 
 impl Port {
@@ -197,7 +204,11 @@ impl Port {
             check,
             address,
             key,
+            is_running,
         } = self;
+        if is_running && is_in_use(&bound) {
+            return Finding::fine(check, format!("{address} is in use while the node runs"));
+        }
         let Err(error) = bound else {
             return Finding::fine(check, format!("{address} is free"));
         };
@@ -207,7 +218,7 @@ impl Port {
             }
             io::ErrorKind::PermissionDenied => format!("set `{key}` to port 1024 or higher"),
             _ => {
-                format!("stop the program that uses it (this node, if it runs), or change `{key}`")
+                format!("stop the program that uses it, or change `{key}`")
             }
         };
         Finding::broken(check, format!("{address}: {}", describe(&error)), fix)
@@ -219,18 +230,25 @@ impl Port {
             check,
             address,
             key,
+            is_running,
         } = self;
         match bound {
-            Err(error) => {
+            Err(error) if !is_running => {
                 let seen = format!(
                     "{address}: {}, the node will take a free one",
                     describe(&error)
                 );
                 Finding::doubtful(check, seen, format!("set `{key}` if {unless}"))
             }
-            Ok(_) => self.of(bound),
+            _ => self.of(bound),
         }
     }
+}
+
+fn is_in_use<T>(bound: &io::Result<T>) -> bool {
+    bound
+        .as_ref()
+        .is_err_and(|error| error.kind() == io::ErrorKind::AddrInUse)
 }
 
 /// Checks that a datagram to the multicast group returns.

@@ -7,6 +7,7 @@
 mod cameras;
 mod cells;
 mod extraction;
+mod guidance;
 mod observer;
 mod printed;
 mod shared;
@@ -57,8 +58,7 @@ pub struct NodeConfig {
     pub role: Role,
     /// Address at which the embedded broker listens. Default: with `[tls]`, port 8883 on all
     /// interfaces; without, port 1883 on 127.0.0.1, which other machines cannot reach, unless
-    /// `broker.allow_plaintext` is set. A broker that only serves local programs takes a free port
-    /// if the default port is in use.
+    /// `broker.allow_plaintext` is set. The broker takes a free port if the default port is in use.
     pub listen: Option<SocketAddr>,
     /// Directory for state that survives a restart: reputations and the highest term of leadership.
     /// Default `$STATE_DIRECTORY`, which systemd sets. Without either, reputations end with the
@@ -443,10 +443,10 @@ impl NodeConfig {
         self.serves_nodes() || self.broker.door
     }
 
-    /// True if the broker takes a free port where the usual one is in use: only programs of this
-    /// machine need it.
+    /// True if the broker takes a free port where the usual one is in use: other nodes learn its
+    /// address from the membership.
     pub fn may_listen_at_any_port(&self) -> bool {
-        self.listen.is_none() && !self.serves_nodes()
+        self.listen.is_none()
     }
 
     /// Which brokers carry the cell's data.

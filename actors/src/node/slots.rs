@@ -19,7 +19,8 @@ use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
 
 /// A part of a node, in the order of starting.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, strum::Display)]
+#[strum(serialize_all = "snake_case")]
 pub enum ActorKind {
     /// The writer of the log.
     Recorder,

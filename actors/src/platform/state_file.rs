@@ -20,6 +20,7 @@ use ring::digest::{SHA256, digest};
 use rustix::fs::OFlags;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use tracing::field::display;
 
 use crate::platform::bounded_file;
 
@@ -97,10 +98,10 @@ impl StateFile {
     /// Renames the file to `….set-aside`, with a warning that contains the reason.
     pub fn set_aside(&self, why: &str) {
         let aside = self.path.with_extension("set-aside");
-        let moved = fs::rename(&self.path, &aside).err();
+        let failure = fs::rename(&self.path, &aside).err().map(display);
         let (path, aside) = (self.path.display(), aside.display());
         tracing::warn!(
-            %path, %aside, why, ?moved,
+            %path, %aside, why, failure,
             "state set aside, the node goes on without it; to use a copy of yours, put it there while the node is stopped"
         );
     }

@@ -12,6 +12,7 @@ mod http;
 mod load;
 mod map;
 mod metrics;
+mod missing;
 #[cfg(feature = "camera")]
 mod mount;
 mod pictures;

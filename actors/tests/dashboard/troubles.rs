@@ -353,28 +353,41 @@ async fn a_camera_that_has_turned_is_named_with_its_angle() {
     node.stop().await;
 }
 
-/// An observer that stops properly is not listed as a node that was lost.
+/// An observer counts neither as a node nor, after it was killed, as a missing one.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_observer_that_has_stopped_is_not_there() {
+async fn an_observer_is_no_node() {
     let (edge, page) = start(config("edge", Role::Edge, 1)).await;
-    let mut looking = config("top", Role::Cav, 1).observing("top").unwrap();
-    let name = looking.name.clone().unwrap();
+    let mut looking = config("euclid", Role::Cav, 1).observing("top").unwrap();
     looking.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
-    let observer = ecod_actors::node::start(looking).await.unwrap();
-    let state = || async {
-        let picture = get(page, "/api/picture").await.json();
-        let nodes = picture["nodes"].as_array().unwrap().clone();
-        nodes
-            .iter()
-            .find(|node| node["name"] == name.as_str())
-            .map(|node| node["state"].as_str().map(str::to_owned))
-    };
-    until("it is there, with its status", || async {
-        state().await.flatten().as_deref() == Some("following")
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .unwrap();
+    let observer = runtime
+        .spawn(ecod_actors::node::start(looking))
+        .await
+        .unwrap()
+        .unwrap();
+    until("the observer follows the edge", || async {
+        observer.newest_map().borrow().is_some()
     })
     .await;
-    observer.stop().await;
-    until("it is gone", || async { state().await.is_none() }).await;
+    let is_alone = || async {
+        let picture = get(page, "/api/picture").await.json();
+        let ready = get(page, "/readyz").await.json();
+        let metrics = get(page, "/metrics").await.body;
+        picture["nodes"].as_array().unwrap().len() == 1
+            && ready.get("missing").is_none()
+            && metrics.contains("ecod_members 1")
+    };
+    assert!(is_alone().await, "while it observes");
+    runtime.shutdown_background();
+    until("the observer is gone", || async {
+        edge.members().borrow().is_empty()
+    })
+    .await;
+    assert!(is_alone().await, "after it was killed");
     edge.stop().await;
 }
 

@@ -123,6 +123,63 @@ fn errors_in_the_environment_name_the_variable_and_show_no_password() {
 }
 
 #[test]
+fn a_misspelt_key_is_answered_with_the_key_that_was_meant() {
+    for (toml, key, meant) in [
+        ("nmae = \"ada\"", "nmae", "name"),
+        (
+            "[mqtt]\nkeepalive_s = 7",
+            "mqtt.keepalive_s",
+            "keep_alive_s",
+        ),
+        ("[dashbord]\nenabled = false", "dashbord", "dashboard"),
+    ] {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        write!(file, "{toml}").unwrap();
+        let mut node = ecod_node();
+        node.arg("--config").arg(file.path()).arg("--print-config");
+        let output = node.output().unwrap();
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(
+            error.contains(&format!("`{key}`"))
+                && error.contains(&format!("did you mean `{meant}`?")),
+            "{error}"
+        );
+    }
+}
+
+/// Every command that writes a file takes its name by the same flag, and still by its former one.
+#[test]
+fn files_to_write_are_named_by_output() {
+    for (command, former) in [
+        ("replay", None),
+        ("report", None),
+        ("calibrate", Some("--out")),
+        ("try", Some("--save")),
+    ] {
+        if !cfg!(feature = "camera") && former.is_some() {
+            continue;
+        }
+        let help = ecod_node().args([command, "--help"]).output().unwrap();
+        let help = String::from_utf8(help.stdout).unwrap();
+        assert!(
+            help.contains("--output <FILE>")
+                && !help.contains("--out <")
+                && !help.contains("--save"),
+            "{command}: {help}"
+        );
+        if let Some(former) = former {
+            let output = ecod_node().args([command, former]).output().unwrap();
+            assert!(
+                stderr(&output).contains("a value is required for '--output <FILE>'"),
+                "{command} {former}: {}",
+                stderr(&output)
+            );
+        }
+    }
+}
+
+#[test]
 fn the_page_is_there_unless_it_is_switched_off() {
     let off = ("ECOD_DASHBOARD__ENABLED", "false");
     for (environment, flags, enabled, listen) in [

@@ -14,6 +14,7 @@ mod schema;
 mod service;
 #[cfg(all(feature = "camera", feature = "otel"))]
 mod spans;
+mod status;
 #[cfg(feature = "camera")]
 mod try_pictures;
 #[cfg(feature = "camera")]

@@ -190,7 +190,7 @@ async fn an_observer_records_what_all_say() {
             .args(arguments)
             .spawn()
             .unwrap();
-        let name = format!("recorder-{}", observer.id());
+        let name = format!("edge--recorder-{}", observer.id());
         let mut observer = disk::Process(observer);
         cell.until("the observer takes part", |cell| {
             cell.node("edge")

@@ -67,7 +67,7 @@ pub(super) struct BenchArguments {
     doors: bool,
     /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other
     /// sections stay
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     out: Option<PathBuf>,
 }
 

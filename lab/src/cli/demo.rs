@@ -53,7 +53,13 @@ pub(super) struct DemoArguments {
     #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
     /// Directory for results, pictures, configurations and logs
-    #[arg(long, value_name = "DIR", default_value = "demo")]
+    #[arg(
+        short,
+        long = "output",
+        alias = "out",
+        value_name = "DIR",
+        default_value = "demo"
+    )]
     out: PathBuf,
 }
 

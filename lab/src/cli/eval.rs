@@ -50,7 +50,7 @@ pub(super) struct EvalArguments {
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = frame_rate, requires = "format")]
     frame_rate: f64,
     /// Write the results to this file (JSON)
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     out: Option<PathBuf>,
 }
 

@@ -32,7 +32,7 @@ pub(super) struct EvalLabelsArguments {
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
     orders: u64,
     /// Write the labels after all passes to this file (CSV), with their probabilities
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     out: Option<PathBuf>,
 }
 

@@ -15,7 +15,7 @@ use crate::street::{Street, StreetCamera, video};
 #[derive(Debug, Args)]
 pub(super) struct StreetArguments {
     /// Directory for videos and configurations
-    #[arg(long, value_name = "DIR")]
+    #[arg(short, long = "output", alias = "out", value_name = "DIR")]
     out: PathBuf,
 }
 

@@ -58,11 +58,11 @@ pub(super) struct TestbedArguments {
     #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) occupied_at_least: Option<f64>,
     /// Write the results to this file (JSON)
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     pub(super) out: Option<PathBuf>,
 }
 
-/// The file of `--out`.
+/// The file of `--output`.
 #[derive(Serialize)]
 pub(super) struct Results<'a, T = SceneResult> {
     pub(super) scenes: &'a [T],

@@ -33,7 +33,7 @@ pub(super) struct ExportArguments {
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = clap::value_parser!(u64).range(2..))]
     seconds: u64,
     /// File to be written: NAME.geojson or NAME.mcap
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     out: PathBuf,
 }
 

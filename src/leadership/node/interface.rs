@@ -147,6 +147,8 @@ pub enum Input {
         troubles: Vec<Trouble>,
         /// Address and port of its page.
         page: Option<String>,
+        /// Nodes that were dismissed here.
+        dismissed: Vec<NodeName>,
     },
     /// The node is about to stop.
     Leave,

@@ -241,6 +241,7 @@ fn every_field_of_every_payload_survives() {
             remedy: "run a time service".into(),
         }],
         page: Some("10.0.0.2:8080".into()),
+        dismissed: vec![node("gauss")],
         ..NodeStatus::starting(node("edge"), Uuid::from_u128(7), Role::Edge, "0.1.0")
     });
 }

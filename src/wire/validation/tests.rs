@@ -149,6 +149,7 @@ fn status() -> NodeStatus {
             remedy: "run a time service".into(),
         }],
         page: Some("[fe80::1]:8080".into()),
+        dismissed: vec![NodeName::from_static("gauss")],
     }
 }
 
@@ -413,6 +414,10 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|s| s.version = "0".repeat(1000), RejectReason::InvalidLabel),
             (
                 |s| s.troubles = vec![s.troubles[0].clone(); MAX_TROUBLES + 1],
+                RejectReason::TooManyObjects,
+            ),
+            (
+                |s| s.dismissed = vec![edge(); MAX_DISMISSED + 1],
                 RejectReason::TooManyObjects,
             ),
             (

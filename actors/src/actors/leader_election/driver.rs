@@ -6,7 +6,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::diagnostics::TroubleKind;
+use chrono::DateTime;
+use ecod::diagnostics::{MISSING_TIMEOUT, MissingNode, TroubleKind, in_words};
 use ecod::leadership::cell_time::{CellTime, ClockEvent, WrongClock};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
@@ -29,6 +30,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
+use crate::observe::dashboard::LiveState;
 use crate::observe::recorder::LogItem;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -49,6 +51,7 @@ pub struct ElectionDriver {
     leadership: watch::Sender<Leadership>,
     counters: Arc<Counters>,
     life_signs: LifeSigns,
+    live_state: Arc<LiveState>,
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
@@ -79,6 +82,7 @@ impl ElectionDriver {
             cell,
             credentials,
             counters,
+            live_state,
         } = arguments;
         let saved_term = saved_term(term_file.as_ref());
         own_broker.mark_changed();
@@ -97,6 +101,7 @@ impl ElectionDriver {
             leadership,
             counters,
             life_signs: LifeSigns::new(cell, credentials),
+            live_state,
             overreached: BTreeSet::new(),
             name,
             complaint: None,
@@ -287,7 +292,10 @@ impl ElectionDriver {
                     clock::now(),
                 );
                 events.into_iter().for_each(log_clock);
+                self.live_state
+                    .check_members(&self.members.borrow(), clock::now());
                 self.note_troubles();
+                let dismissed = self.live_state.expected().dismissed();
                 let looked = Input::Looked {
                     rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
@@ -295,7 +303,14 @@ impl ElectionDriver {
                 };
                 let page = self.page.borrow().map(|page| page.to_string());
                 let troubles = self.counters.troubles().present();
-                return vec![looked, Input::Telling { troubles, page }];
+                return vec![
+                    looked,
+                    Input::Telling {
+                        troubles,
+                        page,
+                        dismissed,
+                    },
+                ];
             }
             Effect::AskParts => {
                 let certificate_ends = self.life_signs.credentials().is_some_and(probe::ends_soon);
@@ -318,7 +333,7 @@ impl ElectionDriver {
                     .reject(RejectReason::NotPermitted, from.as_str());
                 if self.overreached.insert(from.clone()) {
                     tracing::warn!(
-                        %from, ?role, priority, ?rights,
+                        %from, %role, priority, allowed_role = %rights.role, allowed_priority = rights.priority,
                         "a node declares more than its certificate allows and counts as what that says; issue it a \
                          certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
                     );
@@ -337,8 +352,8 @@ impl ElectionDriver {
         Vec::new()
     }
 
-    /// Records troubles: wrong clocks, the leader's complaint, the end of the node's own
-    /// certificate, and an unused description of the cell.
+    /// Records troubles: wrong clocks, missing nodes, the leader's complaint, the end of the node's
+    /// own certificate, and an unused description of the cell.
     fn note_troubles(&self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
         for clock in self.cell_time.wrong_clocks(clock::now()) {
@@ -355,6 +370,15 @@ impl ElectionDriver {
         for name in &self.no_login {
             let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
             troubles.note_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
+        }
+        let now = clock::now();
+        let missing = self.live_state.expected().missing().into_iter();
+        for MissingNode {
+            name, last_seen, ..
+        } in missing.filter(|node| now.since(node.last_seen) >= MISSING_TIMEOUT)
+        {
+            let cause = missing_words(now.since(last_seen), clock::wall());
+            troubles.note_about(name.as_str(), TroubleKind::NodeMissing, &cause);
         }
         let complaint = self
             .complaint
@@ -394,7 +418,7 @@ impl ElectionDriver {
         if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
             tracing::info!(
-                ?position,
+                %position,
                 leader = epoch,
                 standby,
                 "the leader or the standby has changed"
@@ -416,6 +440,12 @@ impl ElectionDriver {
     }
 }
 
+/// Names in one text.
+fn list(names: &[NodeName]) -> String {
+    let names: Vec<_> = names.iter().map(NodeName::as_str).collect();
+    names.join(", ")
+}
+
 /// Converts a member to the form that the node's leadership needs.
 fn as_seen(member: &Member) -> node::SeenMember {
     node::SeenMember {
@@ -424,6 +454,18 @@ fn as_seen(member: &Member) -> node::SeenMember {
         broker: member.broker.map(BrokerAddress::from),
         is_on_this_machine: is_of_this_machine(member.gossip.ip()),
     }
+}
+
+/// The absence of a node as text.
+fn missing_words(absence: Duration, wall: Timestamp) -> String {
+    let last_seen = wall - absence;
+    let at = i64::try_from(last_seen.micros())
+        .ok()
+        .and_then(DateTime::from_timestamp_micros);
+    let at = at.map_or_else(String::new, |at| {
+        at.format(", last seen %Y-%m-%d %H:%M:%S UTC").to_string()
+    });
+    format!("gone for {}{at}", in_words(absence))
 }
 
 /// The remaining validity of the node's own certificate as text.
@@ -502,7 +544,7 @@ fn log(notice: Notice) {
             );
         }
         Notice::OutOfReach { members } => tracing::warn!(
-            ?members,
+            members = list(&members),
             "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),

@@ -80,7 +80,8 @@ impl ReputationStore {
             contributors,
         } in standing.remove_invalid()
         {
-            tracing::warn!(%reason, vehicles = ?contributors, "a saved reputation is not used");
+            let vehicles: Vec<_> = contributors.iter().map(NodeName::as_str).collect();
+            tracing::warn!(%reason, vehicles = vehicles.join(", "), "a saved reputation is not used");
         }
         self.standing = standing.reputations;
         let share = |entries, marks| LedgerShare {

@@ -175,7 +175,7 @@ impl RegionLink {
         };
         let before = std::mem::replace(&mut self.link.state, state);
         if before != state {
-            tracing::info!(broker = %self.link.broker, ?state, "uplink changed");
+            tracing::info!(broker = %self.link.broker, %state, "uplink changed");
         }
         state == LinkState::Up && before != LinkState::Stalled
     }
@@ -203,7 +203,7 @@ impl RegionLink {
         // This cell's own map comes back, like the maps of the cells around.
         if self.link.state == LinkState::Up && self.link.misses_echo(now) {
             self.link.state = LinkState::Stalled;
-            tracing::info!(broker = %self.link.broker, state = ?LinkState::Stalled, "uplink changed");
+            tracing::info!(broker = %self.link.broker, state = %LinkState::Stalled, "uplink changed");
         }
         is_sent
     }

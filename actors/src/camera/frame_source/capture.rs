@@ -270,7 +270,8 @@ impl CaptureLoop {
             };
             let retry_after = self.config.retry_after(failures);
             self.failures.fetch_add(1, Ordering::Relaxed);
-            tracing::info!(%error, failures, ?retry_after, "frame source failed");
+            let retry_after_s = retry_after.as_secs_f64();
+            tracing::info!(%error, failures, retry_after_s, "frame source failed");
             self.status.send_replace(CaptureStatus::Failed {
                 error,
                 failures,

@@ -168,7 +168,7 @@ impl MountArguments {
         };
         let no_camera = || match &self.camera {
             None => anyhow!(
-                "{:?} has no [camera]: `ecod-node try --save node.toml` writes one",
+                "{:?} has no [camera]: `ecod-node try --output node.toml` writes one",
                 self.config
             ),
             Some(name) => anyhow!(

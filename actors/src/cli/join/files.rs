@@ -10,14 +10,12 @@ use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
 
+use crate::cli::installation::{self, SERVICE_DIRECTORY};
 use crate::node::config::END_OF_CONFIGURATION;
 use crate::platform::bounded_file;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
 use crate::transport::pki::{CityTlsConfig, Credentials, TlsConfig};
-
-/// Directory from which the service reads its configuration.
-const SERVICE_DIRECTORY: &str = "/etc/ecod";
 
 /// Directory of the service's state.
 const STATE_DIRECTORY: &str = "/var/lib/ecod";
@@ -56,14 +54,12 @@ struct MembershipSection<'a> {
 impl NodeDirectory {
     /// The given directory, or this user's default directory; it is created if missing.
     pub(super) fn new(given: Option<&Path>) -> anyhow::Result<Self> {
-        let is_root = fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0);
-        let usual = if is_root { SERVICE_DIRECTORY } else { "ecod" };
-        let path = given.unwrap_or(Path::new(usual));
+        let path = given.unwrap_or(installation::directory());
         let made = DirBuilder::new().recursive(true).mode(0o750).create(path);
         let path = made
             .and_then(|()| path.canonicalize())
             .with_context(|| format!("cannot use {}", path.display()))?;
-        let is_service = is_root && path == Path::new(SERVICE_DIRECTORY);
+        let is_service = installation::is_root() && path == Path::new(SERVICE_DIRECTORY);
         Ok(Self {
             path,
             state_of_service: is_service.then(|| STATE_DIRECTORY.into()),

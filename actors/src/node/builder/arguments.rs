@@ -400,6 +400,7 @@ impl NodeBuilder {
             credentials: self.security.credentials.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
+            live_state: self.live_state(),
         }
     }
 
@@ -419,6 +420,8 @@ impl NodeBuilder {
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
+            guide: self.config.reporting(*self.vehicle.listens_at.borrow()),
+            certificate_ends_us: None,
         };
         let sources = NodeSources {
             node,
@@ -471,6 +474,7 @@ impl NodeBuilder {
         let credentials = self.security.credentials.clone();
         let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
         let shared = self.shared.subscribe();
+        let (may_lead, to_dismiss) = (self.config.may_lead(), self.live_state());
         let (gateway, to_watch, live_state) = (
             self.slots.gateway.clone(),
             self.slots.gateway.clone(),
@@ -518,6 +522,15 @@ impl NodeBuilder {
                 } else {
                     Err("the node is just starting: try again".into())
                 }
+            }),
+            dismiss: Arc::new(move |name| {
+                if !may_lead {
+                    return Err("this node never leads and only follows: dismiss the node at one that may lead".into());
+                }
+                let is_dismissed = to_dismiss.dismiss(name, clock::now());
+                is_dismissed.then_some(()).ok_or_else(|| {
+                    format!("{name} answers, or this node has not seen it as a member; a node that answers leaves when it is stopped")
+                })
             }),
             watch_reports: Arc::new(move |wanted| {
                 live_state.set_programs_want_reports(wanted);

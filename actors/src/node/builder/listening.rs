@@ -43,14 +43,17 @@ impl NodeBuilder {
             attempts -= 1;
             match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
                 Err(BrokerError::Bind { .. }) if takes_any_port && address.port() != 0 => {
-                    tracing::info!(%address, "the door takes a free port, key `listen` is not set and the usual one is in use");
+                    tracing::warn!(
+                        %address,
+                        "another program uses this port: the broker takes a free one; set `listen` if programs or a firewall need a fixed port"
+                    );
                     address.set_port(0);
                     attempts += 1;
                 }
                 Err(BrokerError::Bind { .. }) if attempts > 0 => {
                     tokio::time::sleep(REBIND_WAIT).await;
                 }
-                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
+                outcome => break outcome.map_err(unusable_address)?,
             }
         };
         self.vehicle.listens_at.send_replace(Some(bound));
@@ -136,6 +139,15 @@ impl NodeBuilder {
         self.slots.membership.set(actor);
         Ok(id)
     }
+}
+
+/// The error of a broker that cannot listen at the configured address, with the remedy.
+fn unusable_address(error: BrokerError) -> String {
+    let remedy = match &error {
+        BrokerError::Bind { .. } => ": set another address, or stop the program that uses this one",
+        _ => "",
+    };
+    format!("key `listen`: {error}{remedy}")
 }
 
 /// The rule of the node's own broker: which nodes may publish for the whole cell.

@@ -112,14 +112,15 @@ fn describe(errors: figment::Error) -> String {
             None => String::new(),
         };
         let reason = match &error.kind {
-            figment::error::Kind::InvalidType(..) | figment::error::Kind::InvalidValue(..)
+            Kind::InvalidType(..) | Kind::InvalidValue(..)
                 if SECRETS.iter().any(|secret| key.ends_with(secret)) =>
             {
                 "must be text in quotes".to_owned()
             }
-            figment::error::Kind::Message(text) if text == "invalid socket address syntax" => {
+            Kind::Message(text) if text == "invalid socket address syntax" => {
                 "must be an IP address and a port, such as 0.0.0.0:1883".to_owned()
             }
+            Kind::UnknownField(key, keys) => unknown_key(key, keys),
             kind => without_secrets(&kind.to_string()),
         };
         // Without a key, the file itself cannot be read as TOML.
@@ -136,10 +137,27 @@ fn describe(errors: figment::Error) -> String {
         .join("\n")
 }
 
+/// Similarity from which a key is suggested in place of an unknown one.
+const SIMILAR: f64 = 0.75;
+
+/// The error of a key that does not exist: the most similar key, or else all keys.
+fn unknown_key(unknown: &str, keys: &[&str]) -> String {
+    let similarity = |key: &&str| strsim::jaro(unknown, key);
+    let similar = keys
+        .iter()
+        .copied()
+        .max_by(|one, other| similarity(one).total_cmp(&similarity(other)))
+        .filter(|key| similarity(key) >= SIMILAR);
+    match similar {
+        Some(key) => format!("unknown key; did you mean `{key}`?"),
+        None => format!("unknown key; the keys here are `{}`", keys.join("`, `")),
+    }
+}
+
 /// The wrong key in a table that is selected by its `kind`: serde reads such a table from a buffer
 /// and loses the position. It is the key without which the error changes.
 fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
-    if matches!(error.kind, figment::error::Kind::MissingField(_)) {
+    if matches!(error.kind, Kind::MissingField(_)) {
         return None;
     }
     let keys = figment

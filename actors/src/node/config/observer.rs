@@ -8,21 +8,18 @@ use crate::transport::pki::OBSERVER_MARK;
 
 impl NodeConfig {
     /// The configuration of an observer that runs in addition to the node, for some purpose: it
-    /// cannot lead, has no camera and keeps no state.
+    /// cannot lead, has no camera and keeps no state. Its name is below that of the node, so that
+    /// other nodes do not count it as a node.
     ///
     /// # Errors
     /// Returns an error if its name, made of the node's name and the purpose, would be too long.
     pub fn observing(self, purpose: &str) -> Result<Self, InvalidName> {
-        let own = format!("{purpose}-{}", std::process::id());
-        let holder = self.name.as_ref().filter(|_| self.tls.is_some());
-        let name = holder.map_or_else(
-            || own.clone(),
-            |holder| format!("{holder}{OBSERVER_MARK}{own}"),
-        );
+        let holder = self.name.clone().unwrap_or(NodeName::from_static("node"));
+        let process = std::process::id();
+        let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{purpose}-{process}"))?;
         let observer = Self {
-            name: Some(NodeName::new(name)?),
+            name: Some(name),
             role: Role::Cav,
-            record: None,
             description: None,
             ..self
         };

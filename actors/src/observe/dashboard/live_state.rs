@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use ecod::admission::report_window::MAX_PARTS;
-use ecod::diagnostics::TroubleKind;
+use ecod::diagnostics::{ExpectedNodes, TroubleKind};
 use ecod::model::names::{NodeName, PART_MARK};
 use ecod::model::time::Timestamp;
 #[cfg(feature = "camera")]
@@ -15,6 +15,7 @@ use ecod::wire::WirePose;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
 
+use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 
 /// Latest report and status of each node. The links' tasks write and the dashboard reads; the two
@@ -25,6 +26,7 @@ pub struct LiveState {
     /// True if browsers want reports, and if local programs do.
     wants_reports: [AtomicBool; 2],
     latest: Mutex<Latest>,
+    expected: Mutex<ExpectedNodes>,
 }
 
 #[derive(Debug, Default)]
@@ -101,6 +103,7 @@ impl LiveState {
                 status,
                 via: broker,
             } => {
+                self.expected().receive(status, received_at);
                 let mut via = latest
                     .statuses
                     .remove(&status.node)
@@ -181,6 +184,22 @@ impl LiveState {
         reports.max_by_key(|entry| entry.received_at)?.report.pose
     }
 
+    /// Processes a check of the membership: the other nodes that answer now.
+    pub(crate) fn check_members(&self, members: &[Member], now: Timestamp) {
+        let present = members.iter().map(|member| (&member.name, member.role));
+        self.expected().check(present, now);
+    }
+
+    /// Dismisses a missing node for all nodes of the cell; false if it answers or is not expected.
+    pub(crate) fn dismiss(&self, name: &NodeName, now: Timestamp) -> bool {
+        self.expected().dismiss(name, now)
+    }
+
+    /// The nodes that the cell expects. Must not be held across an await.
+    pub(crate) fn expected(&self) -> MutexGuard<'_, ExpectedNodes> {
+        self.expected.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Latest status of each node.
     pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
         self.latest().statuses.clone()
@@ -188,7 +207,7 @@ impl LiveState {
 
     /// The current troubles of the cell, each once: first the troubles that this node `name` has
     /// found, then the leader's reports, then living nodes' reports about themselves and about
-    /// hosts and brokers that they do not reach. A vehicle with its parts has room for
+    /// nodes, hosts and brokers that they do not reach. A vehicle with its parts has room for
     /// [`MAX_TROUBLES_OF_ONE`] of these reports. Their text is shown as a quotation, with this
     /// node's remedy for the kind, so that a member cannot write advice onto other nodes' pages.
     pub(crate) fn troubles(
@@ -222,8 +241,8 @@ impl LiveState {
                 .is_some_and(|rest| rest.starts_with(PART_MARK)),
             None => true,
         };
-        let is_separating = |trouble: &Trouble| {
-            TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating)
+        let is_shared = |trouble: &Trouble| {
+            TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_shared)
         };
         let of_leader = living().filter(|(by, _)| leader == Some(*by));
         for (by, trouble) in of_leader {
@@ -234,11 +253,11 @@ impl LiveState {
         let of_members = living().filter(|(by, _)| leader != Some(*by));
         let (of_itself, of_others): (Vec<_>, Vec<_>) =
             of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
-        let separating = of_others
+        let shared = of_others
             .into_iter()
-            .filter(|(_, trouble)| is_separating(trouble));
+            .filter(|(_, trouble)| is_shared(trouble));
         let mut room_of: BTreeMap<NodeName, usize> = BTreeMap::new();
-        for (by, trouble) in of_itself.into_iter().chain(separating) {
+        for (by, trouble) in of_itself.into_iter().chain(shared) {
             let room = room_of.entry(by.vehicle()).or_insert(MAX_TROUBLES_OF_ONE);
             let is_shown = *room > 0
                 && all.len() < MAX_SHOWN_TROUBLES

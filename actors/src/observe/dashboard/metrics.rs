@@ -1,13 +1,14 @@
 //! Metrics of the node for Prometheus, in the OpenMetrics text format.
 //!
 //! All values are read on request; only counters that the node has anyway are kept. The number of
-//! label values is bounded: reasons and states are fixed sets, vehicles are the first
+//! label values is bounded: reasons and states are fixed sets, vehicles and nodes are the first
 //! [`MAX_VEHICLES`] by name.
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::AtomicU64;
 
+use ecod::diagnostics::MissingNode;
 use ecod::leadership::Position;
 use ecod::wire::{ReportKind, Trouble};
 use prometheus_client::encoding::text::encode;
@@ -59,7 +60,7 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
     let labels = vec![
         ("node", facts.name.to_string()),
         ("cell", facts.cell.to_string()),
-        ("role", format!("{:?}", facts.role).to_lowercase()),
+        ("role", facts.role.to_string()),
         ("version", facts.version.to_owned()),
     ];
     gauges(
@@ -75,13 +76,16 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
         ready,
         i64::from(monitor.readiness().ready),
     );
-    let members = count(sources.members.borrow().len() + 1);
+    let others = sources.members.borrow();
+    let others = others.iter().filter(|member| !member.name.is_part());
+    let members = count(others.count() + 1);
     gauge(
         registry,
         "members",
         "Nodes of the cell that answer, this one included",
         members,
     );
+    missing(registry, monitor);
     let serves = "Whether the node's embedded broker serves; 0 also on a node without one";
     gauge(
         registry,
@@ -107,6 +111,26 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
         "Browsers that receive live snapshots",
         count(monitor.viewers()),
     );
+}
+
+/// The series of a node exists only while the node is missing.
+fn missing(registry: &mut Registry, monitor: &NodeMonitor) {
+    let absences = Family::<Labels, FloatGauge>::default();
+    let help =
+        "Time since an expected node that does not answer last did; the first nodes by name only";
+    registry.register_with_unit("member_missing", help, Unit::Seconds, absences.clone());
+    let (now, nodes) = (
+        clock::now(),
+        monitor.sources.live_state.expected().missing(),
+    );
+    for MissingNode {
+        name, last_seen, ..
+    } in nodes.into_iter().take(MAX_VEHICLES)
+    {
+        absences
+            .get_or_create(&vec![("member", name.to_string())])
+            .set(now.since(last_seen).as_secs_f64());
+    }
 }
 
 fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {

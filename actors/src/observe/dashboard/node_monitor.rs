@@ -1,6 +1,5 @@
 //! Observation of the node: its history, its health, and the snapshots that browsers get.
 
-use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -8,7 +7,6 @@ use bytes::Bytes;
 use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::epoch::Epoch;
-use ecod::model::names::NodeName;
 use tokio::sync::watch;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval};
 
@@ -43,8 +41,6 @@ pub(crate) struct Observed {
     pub(crate) history: History,
     /// Latest answers of gateway and broker.
     pub(crate) probe: Probe,
-    /// Nodes that answer, or answered and still have a status at a broker.
-    met: BTreeSet<NodeName>,
 }
 
 /// Time between two probes of gateway and broker.
@@ -122,11 +118,7 @@ impl NodeMonitor {
             newest.map.borrow().clone(),
         );
         let observed = self.observed();
-        let Observed {
-            history,
-            probe,
-            met,
-        } = &*observed;
+        let Observed { history, probe } = &*observed;
         let since = history
             .terms
             .back()
@@ -136,7 +128,7 @@ impl NodeMonitor {
             .links
             .iter()
             .flatten()
-            .map(|(broker, state)| (broker.to_string(), format!("{state:?}").to_lowercase()));
+            .map(|(broker, state)| (broker.to_string(), state.to_string()));
         Snapshot {
             schema: API_VERSION,
             now_us: now,
@@ -157,7 +149,7 @@ impl NodeMonitor {
             verdicts: newest.verdicts.borrow().clone(),
             reputations: newest.reputations.borrow().clone(),
             vehicles: sources.live_state.reports_since(now - MAX_REPORT_AGE),
-            nodes: nodes(sources, met, probe.links.as_ref()),
+            nodes: nodes(sources, probe.links.as_ref()),
             links: links.collect(),
             troubles: self.troubles(),
             counters: sources.counters.snapshot(),
@@ -191,7 +183,6 @@ impl NodeMonitor {
         let (mut samples, mut looks) = (ticks(SAMPLE_PERIOD), ticks(LOOK_PERIOD));
         let (mut next_snapshot, mut changed, mut sent_at) = (Instant::now(), true, Instant::now());
         self.take_leadership();
-        self.take_members();
         loop {
             let due = if changed {
                 next_snapshot
@@ -212,10 +203,7 @@ impl NodeMonitor {
                     self.take_verdicts();
                     changed = true;
                 }
-                Ok(()) = members.changed() => {
-                    self.take_members();
-                    changed = true;
-                }
+                Ok(()) = members.changed() => changed = true,
                 _ = samples.tick() => self.sample(),
                 _ = looks.tick() => self.extend_timeline(),
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
@@ -243,19 +231,6 @@ impl NodeMonitor {
         self.observed()
             .history
             .add_leadership(&leadership, clock::now());
-    }
-
-    fn take_members(&self) {
-        let statuses = self.sources.live_state.statuses();
-        let mut observed = self.observed();
-        observed.met.retain(|name| statuses.contains_key(name));
-        observed.met.extend(
-            self.sources
-                .members
-                .borrow()
-                .iter()
-                .map(|member| member.name.clone()),
-        );
     }
 
     fn take_map(&self) {
@@ -320,12 +295,8 @@ impl NodeMonitor {
             verdicts.as_ref().map(|it| it.received_at),
         ];
         let mut observed = self.observed();
-        let Observed {
-            history,
-            probe,
-            met,
-        } = &mut *observed;
-        let nodes = nodes(sources, met, probe.links.as_ref())
+        let Observed { history, probe } = &mut *observed;
+        let nodes = nodes(sources, probe.links.as_ref())
             .into_iter()
             .filter(|node| node.alive);
         history

@@ -76,12 +76,20 @@ pub struct NodeFacts {
     pub started_at_us: Timestamp,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
+    /// How vehicles begin to report, for a cell without reports.
+    pub guide: String,
+    /// End of the validity of its certificate; absent without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub certificate_ends_us: Option<Timestamp>,
 }
 
 impl NodeSources {
     /// The current facts about the node.
     pub(crate) fn node_facts(&self) -> NodeFacts {
+        let credentials = self.vitals.security.credentials.as_ref();
         NodeFacts {
+            certificate_ends_us: credentials
+                .map(|credentials| credentials.current().identity.expires()),
             round_period_s: self.vitals.shared.borrow().round_period_s,
             ..self.node.clone()
         }

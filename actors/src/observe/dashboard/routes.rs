@@ -15,8 +15,11 @@ use axum::routing::get;
 #[cfg(feature = "camera")]
 use axum::routing::post;
 use axum::{Json, Router};
+use ecod::leadership::readiness::Readiness;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use futures_util::stream;
+use serde::Serialize;
 #[cfg(feature = "camera")]
 use tokio::sync::Semaphore;
 use tokio::sync::watch;
@@ -35,7 +38,6 @@ use super::node_sources::ShownCamera;
 use super::response_cache::ResponseCache;
 use super::snapshot::json;
 use crate::observe::http::{HttpRefusal, PageAccess, PageGuard, with_headers};
-#[cfg(feature = "camera")]
 use crate::platform::clock;
 use crate::telemetry::counters::Event;
 
@@ -147,14 +149,44 @@ impl HttpApi {
 
 type Api = State<Arc<HttpApi>>;
 
+/// Answer of `/readyz`.
+#[derive(Debug, Serialize)]
+struct ReadinessAnswer {
+    #[serde(flatten)]
+    readiness: Readiness,
+    /// Expected nodes that do not answer.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    missing: Vec<MissingAnswer>,
+}
+
+/// An expected node that does not answer.
+#[derive(Debug, Serialize)]
+struct MissingAnswer {
+    node: NodeName,
+    /// Time at which it last answered, by this node's clock.
+    last_seen_us: Timestamp,
+    /// Seconds since then.
+    missing_s: u64,
+}
+
 async fn show_readiness(State(api): Api) -> Response {
-    let readiness = api.monitor.readiness();
+    let (readiness, now) = (api.monitor.readiness(), clock::now());
+    let missing = api.monitor.sources.live_state.expected().missing();
+    let missing = missing.into_iter().map(|node| MissingAnswer {
+        missing_s: now.since(node.last_seen).as_secs(),
+        last_seen_us: node.last_seen,
+        node: node.name,
+    });
     let status = if readiness.ready {
         StatusCode::OK
     } else {
         StatusCode::SERVICE_UNAVAILABLE
     };
-    (status, Json(readiness)).into_response()
+    let answer = ReadinessAnswer {
+        readiness,
+        missing: missing.collect(),
+    };
+    (status, Json(answer)).into_response()
 }
 
 async fn show_metrics(State(api): Api) -> Response {

@@ -109,7 +109,10 @@ async fn listen_anywhere(monitor: &NodeMonitor) -> TcpListener {
     match TcpListener::bind(DEFAULT_ADDRESS).await {
         Ok(listener) => listener,
         Err(error) => {
-            tracing::info!(address = %DEFAULT_ADDRESS, %error, "dashboard takes a free port, key `dashboard.listen` is not set");
+            tracing::warn!(
+                address = %DEFAULT_ADDRESS, %error,
+                "another program uses this port: the page takes a free one; set `dashboard.listen` if it needs a fixed port"
+            );
             listen(SocketAddr::new(DEFAULT_ADDRESS.ip(), 0), monitor).await
         }
     }
@@ -123,7 +126,7 @@ async fn listen(address: SocketAddr, monitor: &NodeMonitor) -> TcpListener {
             Ok(listener) => return listener,
             Err(error) => {
                 if wait == RETRY_MIN {
-                    tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`; trying again");
+                    tracing::warn!(%address, %error, "dashboard cannot listen, key `dashboard.listen`: trying again; set another address, or stop the program that uses this one");
                 }
                 monitor.sources.counters.count(Event::DashboardNotBound);
             }

@@ -1,8 +1,9 @@
 //! All data of a cell that the page shows, as one JSON object.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 
+use ecod::diagnostics::{ExpectedNodes, MissingNode};
 use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
@@ -101,6 +102,12 @@ pub(crate) struct NodeEntry {
     /// Address and port of its page, where this node's users may reach it. Its own page is left
     /// out.
     pub page: Option<SocketAddr>,
+    /// True if the node does not answer although it is expected: it was a member, and has neither
+    /// left in order nor been dismissed.
+    pub missing: bool,
+    /// Time at which a missing node last answered this node.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub last_seen_us: Option<Timestamp>,
 }
 
 /// A value as JSON; truncated where it cannot be encoded, which is logged.
@@ -112,22 +119,18 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
     text
 }
 
-/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is
-/// absent if unknown.
-pub(crate) fn nodes(
-    sources: &NodeSources,
-    met: &BTreeSet<NodeName>,
-    links: Option<&LinkStates>,
-) -> Vec<NodeEntry> {
+/// This node and the others by name, without observers and other parts of nodes. `links` is absent
+/// if unknown.
+pub(crate) fn nodes(sources: &NodeSources, links: Option<&LinkStates>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
     let mut nodes = others(
         &sources.members.borrow(),
         sources.live_state.statuses(),
-        met,
+        &sources.live_state.expected(),
         links,
     );
-    nodes.retain(|node| node.name != own.name);
+    nodes.retain(|node| node.name != own.name && !node.name.is_part());
     nodes.push(NodeEntry {
         name: own.name.clone(),
         role: own.role,
@@ -140,6 +143,8 @@ pub(crate) fn nodes(
         fit: None,
         version: Some(own.version.to_owned()),
         page: None,
+        missing: false,
+        last_seen_us: None,
     });
     nodes.sort_by(|a, b| a.name.cmp(&b.name));
     nodes
@@ -150,7 +155,7 @@ pub(crate) fn nodes(
 fn others(
     members: &[Member],
     mut statuses: BTreeMap<NodeName, ReportedStatus>,
-    met: &BTreeSet<NodeName>,
+    expected: &ExpectedNodes,
     links: Option<&LinkStates>,
 ) -> Vec<NodeEntry> {
     let entry = |name: &NodeName, role, alive, status: Option<&NodeStatus>| NodeEntry {
@@ -161,6 +166,8 @@ fn others(
         fit: status.and_then(|status| status.fit),
         version: status.map(|status| status.version.clone()),
         page: None,
+        missing: false,
+        last_seen_us: None,
     };
     let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
     let mut nodes = Vec::new();
@@ -183,10 +190,29 @@ fn others(
     };
     for ReportedStatus { status, via, .. } in statuses.values() {
         let name = &status.node;
-        let is_online =
-            status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_linked);
+        let is_online = status.state != NodeState::Offline
+            && !expected.contains(name)
+            && via.iter().any(is_linked);
         let alive = is_online || further.iter().any(|member| member.name == *name);
         nodes.push(entry(name, status.role, alive, Some(status)));
+    }
+    for MissingNode {
+        name,
+        role,
+        last_seen,
+    } in expected.missing()
+    {
+        if members.iter().any(|member| member.name == name) {
+            continue;
+        }
+        let at = nodes.iter().position(|node| node.name == name);
+        let at = at.unwrap_or_else(|| {
+            nodes.push(entry(&name, role, false, None));
+            nodes.len() - 1
+        });
+        if let Some(node) = nodes.get_mut(at) {
+            (node.missing, node.last_seen_us) = (true, Some(last_seen));
+        }
     }
     nodes
 }
@@ -243,9 +269,19 @@ mod tests {
         }
         say("both", &edge);
         say("both", &euclid);
+        live_state.check_members(
+            &[
+                member.clone(),
+                Member {
+                    name: name("edge"),
+                    ..member.clone()
+                },
+            ],
+            Timestamp(1),
+        );
         let alive = |members: &[Member], links: &LinkStates| {
-            let met = [name("edge"), name("euclid")].into();
-            let nodes = others(members, live_state.statuses(), &met, Some(links));
+            let expected = live_state.expected();
+            let nodes = others(members, live_state.statuses(), &expected, Some(links));
             nodes
                 .into_iter()
                 .filter(|node| node.alive)

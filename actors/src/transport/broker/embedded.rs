@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::runtime;
 use tokio::sync::oneshot;
+use tracing::field::display;
 
 use super::BrokerHealth;
 use super::departures::ExpulsionSink;
@@ -397,7 +398,10 @@ fn serve(
         };
         tokio::select! {
             () = beating => {}
-            ended = server.run() => tracing::error!(?ended, "broker ended by itself"),
+            ended = server.run() => {
+                let failure = ended.err().map(display);
+                tracing::error!(failure, "broker ended by itself");
+            }
             () = callbacks.door.run(context) => {}
             () = admitting => tracing::error!("frontend ended by itself"),
             _ = stopped => {}

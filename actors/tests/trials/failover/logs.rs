@@ -102,7 +102,7 @@ pub(crate) fn last_accepted(path: &Path) -> anyhow::Result<Option<Accepted>> {
 /// Whom a node's log names as its standby, as of its last word on who leads.
 pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
     let text = fs::read_to_string(log).with_context(|| format!("cannot read {}", log.display()))?;
-    let last = text.lines().rfind(|line| line.contains("position=Leading"));
+    let last = text.lines().rfind(|line| line.contains("position=leading"));
     let name = last
         .and_then(|line| line.split("standby=").nth(1))
         .and_then(|rest| rest.split_whitespace().next());
@@ -202,9 +202,9 @@ mod tests {
 
     #[test]
     fn the_standby_is_whom_the_leader_named_last() {
-        let lines = "INFO leadership position=Leading epoch=edge@1\n\
-                     INFO leadership position=Leading epoch=edge@1 standby=v01\n\
-                     INFO leadership position=Following epoch=v01@2 standby=v02\n";
+        let lines = "INFO leadership position=leading epoch=edge@1\n\
+                     INFO leadership position=leading epoch=edge@1 standby=v01\n\
+                     INFO leadership position=following epoch=v01@2 standby=v02\n";
         assert_eq!(
             standby(file(lines).path()).unwrap().unwrap().as_str(),
             "v01"

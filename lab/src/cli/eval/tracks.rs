@@ -16,7 +16,7 @@ use crate::eval::formats::{FileContext, FileFormat, check_lengths, sequence_at, 
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
-/// Contents of the file of `--out`.
+/// Contents of the file of `--output`.
 #[derive(Serialize)]
 struct Judged {
     tracks: TrackScores,

@@ -101,6 +101,8 @@ function drawText(picture, scene) {
   tables.troubles(picture);
   tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
   tables.verdicts(picture.verdicts, now);
+  text(byId("vehicles-empty"), sentence(picture.node.guide));
+  text(byId("map-empty"), picture.map ? "The map is empty: no vehicle has reported an object or its place" : "Waiting for the first map");
   tables.vehicles(scene.vehicles, now, picture);
   tables.reputations(picture.reputations, scene.colour);
   tables.leaders(live.history, now);

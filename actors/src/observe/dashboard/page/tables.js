@@ -108,18 +108,20 @@ export function leaders({ reigns: terms }, now) {
   ]);
 }
 
-export function nodes({ nodes, node, leadership }) {
+export function nodes({ nodes, node, leadership, now_us }) {
   const states = { following: "follows", aggregating: "leads", offline: "offline" };
   rows(byId("nodes"), nodes, (entry) => entry.name, (entry) => {
     const leads = entry.name === leadership.leader;
-    const state = !entry.alive ? "offline" : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "online";
+    const gone = entry.missing ? `gone for ${span((now_us - entry.last_seen_us) / 1e6)}, last seen ${clock(entry.last_seen_us)}` : "offline";
+    const state = !entry.alive ? gone : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "online";
     const unfit = entry.alive && entry.fit === false ? ", not fit to lead" : "";
     return [
       { text: entry.name + (entry.name === node.name ? " (this)" : ""), href: entry.alive ? pageOf(entry.page) : undefined }, entry.role,
       { text: state + unfit, class: entry.alive ? (unfit ? "warn" : "") : "bad" }, { text: entry.version ?? "–", class: "dim" },
     ];
   });
-  text(byId("nodes-count"), `${nodes.filter((entry) => entry.alive).length} of ${nodes.length} online`);
+  const [alive, missing] = ["alive", "missing"].map((key) => nodes.filter((entry) => entry[key]).length);
+  text(byId("nodes-count"), missing ? `${alive} of ${alive + missing} online` : `${alive} online`);
 }
 
 /// Reject reason of copies that arrive through a second broker; these are no loss.

@@ -5,6 +5,7 @@
 //! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is forwarded to the cell |
 //! | `cell` | is the cell's new description, if `euclid` may lead |
 //! | `nodes/euclid--…` | reaches the programs at this broker |
+//! | `nodes/<node>`, empty | dismisses that node, if it is missing and `euclid` may lead |
 //! | other topics of the cell | is refused |
 //! | `cpm/…` | reaches the programs at this broker |
 //! | anything else | without certificates reaches the programs at this broker |
@@ -125,10 +126,11 @@ impl Door {
             TopicPlace::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
             TopicPlace::Cell => Ok(()),
             TopicPlace::Door => door.may_say(principal, topic),
-            TopicPlace::Inbound if door.setup.topics.parse(topic) == Some(Topic::Cell) => {
-                door.take_description(principal, &publish.payload)
-            }
-            TopicPlace::Inbound => door.take_report(principal, topic, &publish.payload),
+            TopicPlace::Inbound => match door.setup.topics.parse(topic) {
+                Some(Topic::Cell) => door.take_description(principal, &publish.payload),
+                Some(Topic::Nodes(name)) => door.take_dismissal(principal, &name),
+                _ => door.take_report(principal, topic, &publish.payload),
+            },
         }
     }
 
@@ -173,16 +175,17 @@ impl Door {
     }
 
     /// The place for a program's message.
-    fn place_of(&self, principal: &Principal, topic: &str) -> TopicPlace {
+    fn place_of(&self, principal: &Principal, publish: &Publish) -> TopicPlace {
         let Some(door) = self.0.as_deref() else {
             return TopicPlace::Cell;
         };
-        match door.setup.topics.parse(topic) {
+        match door.setup.topics.parse(&publish.topic) {
             Some(Topic::Detections(name) | Topic::VoteDetections(name))
                 if door.is_nodeless(principal, &name) =>
             {
                 TopicPlace::Cell
             }
+            Some(Topic::Nodes(name)) if is_dismissal(&name, publish) => TopicPlace::Inbound,
             Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => TopicPlace::Cell,
             Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => {
                 TopicPlace::Inbound
@@ -351,6 +354,18 @@ impl DoorState {
         (self.setup.describe)(request.text).map_err(malformed)
     }
 
+    /// Dismisses a missing node at the request of a program that may act as the node.
+    fn take_dismissal(&self, principal: &Principal, name: &NodeName) -> Result<(), DoorRefusal> {
+        let DoorSetup { node, dismiss, .. } = &self.setup;
+        if !principal.is_of(node) {
+            let text = format!(
+                "only programs on the machine of {node}, or with its certificate, dismiss a node"
+            );
+            return Err(DoorRefusal::not_permitted(text));
+        }
+        dismiss(name).map_err(DoorRefusal::not_permitted)
+    }
+
     /// True if a filter of a program matches reports.
     fn is_of_reports(&self, filter: &str) -> bool {
         let (_, filter) = TopicPlace::of(filter);
@@ -372,6 +387,12 @@ impl DoorState {
             levels.next().is_none_or(|level| level == "#")
         })
     }
+}
+
+/// True if a program's message on the topic of a node's status requests to dismiss the node: it is
+/// empty and, unlike the withdrawal of a status, not retained.
+fn is_dismissal(name: &NodeName, publish: &Publish) -> bool {
+    publish.payload.is_empty() && !publish.retain && !name.is_part()
 }
 
 /// Hooks of rmqtt that separate programs from nodes.
@@ -439,7 +460,7 @@ impl Handler for DoorHooks {
                     Some(HookResult::Publish(charged)) => charged,
                     _ => (*publish).clone(),
                 };
-                let place = self.door.place_of(&principal, &publish.topic);
+                let place = self.door.place_of(&principal, publish);
                 moved.topic = place.topic(&publish.topic).into();
                 // rmqtt asks for the right to publish a message, but not for that of a last will.
                 if let FromType::LastWill = from.typ()
