@@ -142,6 +142,21 @@ impl ObjectReport {
             moving: None,
         }
     }
+
+    /// The report in the form that VOTE needs: only objects at landmarks.
+    #[must_use]
+    pub fn votes(&self) -> Self {
+        let at_landmarks = self
+            .objects
+            .iter()
+            .filter(|object| object.landmark.is_some());
+        Self {
+            pose: self.pose,
+            objects: at_landmarks.cloned().collect(),
+            clock_error_us: self.clock_error_us,
+            ..Self::new(self.node.clone(), self.seq, self.captured_at_us)
+        }
+    }
 }
 
 /// A camera pose on the wire.
