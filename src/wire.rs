@@ -68,7 +68,7 @@ pub use validation::{
 };
 
 use crate::model::epoch::Epoch;
-use crate::model::geometry::Pose;
+use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
@@ -196,6 +196,12 @@ impl WirePose {
             pitch_rad: None,
             roll_rad: None,
         }
+    }
+
+    /// A pose with a heading in degrees clockwise from the y axis, the north of a frame that is not
+    /// rotated.
+    pub fn from_compass(x_m: f64, y_m: f64, azimuth_deg: f64) -> Self {
+        Self::new(x_m, y_m, wrap_angle((90.0 - azimuth_deg).to_radians()))
     }
 }
 
