@@ -5,6 +5,7 @@
 //! ```text
 //! CAV         -> detections/<node>        ObjectReport   (PACE)
 //! CAV         -> vote_detections/<node>   ObjectReport   whose objects name a landmark (VOTE)
+//! program     -> boxes/<node>             BoxReport      to a node's broker, which projects the boxes
 //! aggregator  -> global_detections        GlobalMap
 //! aggregator  -> global_verdicts          Verdicts
 //! aggregator  -> reputations              Reputations    retained
@@ -22,6 +23,7 @@
 
 #![deny(clippy::indexing_slicing)]
 
+mod box_report;
 mod cell_map;
 mod cell_reputation;
 mod client_refusals;
@@ -46,6 +48,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+pub use box_report::{BoxCamera, BoxReport, PixelBox, decode_boxes, encode_boxes};
 pub use cell_map::{CellMap, NeighbourObject};
 pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
@@ -526,6 +529,7 @@ pub enum NodeState {
 pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
     [
         ("ObjectReport", schemars::schema_for!(ObjectReport)),
+        ("BoxReport", schemars::schema_for!(BoxReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("CellMap", schemars::schema_for!(CellMap)),
         ("CellReputation", schemars::schema_for!(CellReputation)),
