@@ -5,6 +5,7 @@
 //! ```text
 //! CAV         -> detections/<node>        ObjectReport   (PACE)
 //! CAV         -> vote_detections/<node>   ObjectReport   whose objects name a landmark (VOTE)
+//! program     -> boxes/<node>             BoxReport      to a node's broker, which projects the boxes
 //! aggregator  -> global_detections        GlobalMap
 //! aggregator  -> global_verdicts          Verdicts
 //! aggregator  -> reputations              Reputations    retained
@@ -22,6 +23,7 @@
 
 #![deny(clippy::indexing_slicing)]
 
+mod box_report;
 mod cell_map;
 mod cell_reputation;
 mod client_refusals;
@@ -47,6 +49,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+pub use box_report::{BoxCamera, BoxReport, PixelBox, decode_boxes, encode_boxes};
 pub use cell_map::{CellMap, NeighbourObject};
 pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
@@ -69,7 +72,7 @@ pub use validation::{
 };
 
 use crate::model::epoch::Epoch;
-use crate::model::geometry::Pose;
+use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
@@ -143,6 +146,21 @@ impl ObjectReport {
             moving: None,
         }
     }
+
+    /// The report in the form that VOTE needs: only objects at landmarks.
+    #[must_use]
+    pub fn votes(&self) -> Self {
+        let at_landmarks = self
+            .objects
+            .iter()
+            .filter(|object| object.landmark.is_some());
+        Self {
+            pose: self.pose,
+            objects: at_landmarks.cloned().collect(),
+            clock_error_us: self.clock_error_us,
+            ..Self::new(self.node.clone(), self.seq, self.captured_at_us)
+        }
+    }
 }
 
 /// A camera pose on the wire.
@@ -182,6 +200,12 @@ impl WirePose {
             pitch_rad: None,
             roll_rad: None,
         }
+    }
+
+    /// A pose with a heading in degrees clockwise from the y axis, the north of a frame that is not
+    /// rotated.
+    pub fn from_compass(x_m: f64, y_m: f64, azimuth_deg: f64) -> Self {
+        Self::new(x_m, y_m, wrap_angle((90.0 - azimuth_deg).to_radians()))
     }
 }
 
@@ -522,6 +546,7 @@ pub enum NodeState {
 pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
     [
         ("ObjectReport", schemars::schema_for!(ObjectReport)),
+        ("BoxReport", schemars::schema_for!(BoxReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("CellMap", schemars::schema_for!(CellMap)),
         ("CellReputation", schemars::schema_for!(CellReputation)),

@@ -6,7 +6,7 @@
 
 use map_3d::{Ellipsoid, enu2geodetic, enu2uvw, geodetic2enu, uvw2enu};
 use minicbor::{Decode, Encode};
-use nalgebra::Point3;
+use nalgebra::{Point2, Point3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -80,6 +80,9 @@ impl GeographicPose {
 pub enum StatedPose {
     /// In the cell's frame.
     InMap(Pose),
+    /// At a position in the cell's frame in metres, with a heading in degrees clockwise from true
+    /// north. Without an origin, the y axis is north.
+    ByCompass(Point2<f64>, f64),
     /// On Earth.
     OnEarth(GeographicPose),
 }
@@ -114,6 +117,14 @@ impl StatedPose {
     pub fn in_map(&self, origin: Option<&GeographicOrigin>) -> Result<Pose, PoseError> {
         match self {
             Self::InMap(pose) => Ok(*pose),
+            Self::ByCompass(position, azimuth_deg) => {
+                let rotation_deg = origin.map_or(0.0, |origin| origin.rotation_deg);
+                let heading_deg = 90.0 - azimuth_deg - rotation_deg;
+                Ok(Pose {
+                    position: *position,
+                    heading_rad: wrap_angle(heading_deg.to_radians()),
+                })
+            }
             Self::OnEarth(pose) => origin.ok_or(PoseError::NoOrigin)?.pose_to_map(pose),
         }
     }

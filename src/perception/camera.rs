@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
-use crate::model::geometry::Pose;
+use crate::model::geometry::{HEADING_BOUND_RAD, Pose, wrap_angle};
 use crate::wire::WirePose;
 
 /// Focal lengths and principal point of an image, in pixels.
@@ -114,11 +114,17 @@ pub struct Mount {
 }
 
 impl Mount {
-    /// The camera's pose for a pose of the vehicle.
+    /// The camera's pose for a pose of the vehicle. Its heading is within [`HEADING_BOUND_RAD`], as
+    /// receivers of reports require.
     pub fn camera_pose(&self, vehicle: &Pose) -> Pose {
+        let heading_rad = vehicle.heading_rad + self.pan_rad;
         Pose {
             position: vehicle.transform(self.forward_m, self.left_m),
-            heading_rad: vehicle.heading_rad + self.pan_rad,
+            heading_rad: if heading_rad.abs() > HEADING_BOUND_RAD {
+                wrap_angle(heading_rad)
+            } else {
+                heading_rad
+            },
         }
     }
 

@@ -24,7 +24,7 @@ mod paper;
 
 use nalgebra::{Matrix3, Point3};
 
-pub use config::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
+pub use config::{NEURAL_PIXEL_SIGMA_PX, ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ground::HalfDepth;
 pub use mount_check::MountCheck;
 pub use mount_fit::{MIN_BOXES, MountEstimate, MountFitError, fit_mount};

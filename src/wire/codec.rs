@@ -190,6 +190,7 @@ mod tests {
     use proptest::{collection, option};
 
     use super::*;
+    use crate::model::geometry::HEADING_BOUND_RAD;
     use crate::model::time::Timestamp;
     use crate::wire::{FieldOfView, Flaw, PerceivedObject, Reputations, WirePose};
 
@@ -550,7 +551,7 @@ mod tests {
     prop_compose! {
         fn reports()(
             (seq, captured_at) in (any::<u64>(), any::<u64>()),
-            pose in option::of((-1e8..1e8f64, -1e8..1e8f64, -10.0..10.0f64)),
+            pose in option::of((-1e8..1e8f64, -1e8..1e8f64, -HEADING_BOUND_RAD..HEADING_BOUND_RAD)),
             objects in collection::vec(object(), 0..20),
             seen in option::of(collection::vec("[a-z]{1,8}", 0..5)),
         ) -> ObjectReport {

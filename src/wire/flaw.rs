@@ -92,7 +92,7 @@ impl Flaw {
     }
 
     /// The flaw of an invalid value.
-    fn of_value(payload: &Value, reason: RejectReason, field: String) -> Self {
+    pub(super) fn of_value(payload: &Value, reason: RejectReason, field: String) -> Self {
         let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
         // A key that contains a dot cannot be found again.
         let value = payload.pointer(&pointer);
@@ -113,6 +113,9 @@ impl Flaw {
             RejectReason::InvalidLabel => {
                 format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
             }
+            RejectReason::OutOfRange if field == "pose.heading_rad" => format!(
+                "is beyond 2π{shown}; a heading is in radians, counter-clockwise from east: is this one in degrees?"
+            ),
             _ => format!("is out of bounds{shown}"),
         };
         Self::new(reason, field, fault)

@@ -63,6 +63,8 @@ reject_reasons! {
     NotElected = "not_elected",
     /// A report for an algorithm that the cell does not run.
     NotFused = "not_fused",
+    /// A box of a program that gives no position, such as one above the horizon.
+    NotPlaced = "not_placed",
     /// A payload without the cell's signature, or evidence or a round without its aggregator's
     /// signature, where one is required.
     BadSignature = "bad_signature",

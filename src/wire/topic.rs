@@ -13,6 +13,8 @@ pub enum Topic {
     Detections(NodeName),
     /// A vehicle's reports for VOTE.
     VoteDetections(NodeName),
+    /// Boxes in images of a program, which the node whose broker receives them projects.
+    Boxes(NodeName),
     /// Fused maps.
     GlobalDetections,
     /// Verdicts.
@@ -99,6 +101,7 @@ impl Topics {
         match (kind, node) {
             ("detections", Some(node)) => NodeName::new(node).ok().map(Topic::Detections),
             ("vote_detections", Some(node)) => NodeName::new(node).ok().map(Topic::VoteDetections),
+            ("boxes", Some(node)) => NodeName::new(node).ok().map(Topic::Boxes),
             ("ledger", Some(node)) => NodeName::new(node).ok().map(Topic::Ledger),
             ("nodes", Some(node)) => NodeName::new(node).ok().map(Topic::Nodes),
             ("global_detections", None) => Some(Topic::GlobalDetections),
@@ -115,6 +118,7 @@ impl fmt::Display for Topic {
         match self {
             Self::Detections(node) => write!(f, "detections/{node}"),
             Self::VoteDetections(node) => write!(f, "vote_detections/{node}"),
+            Self::Boxes(node) => write!(f, "boxes/{node}"),
             Self::GlobalDetections => f.write_str("global_detections"),
             Self::GlobalVerdicts => f.write_str("global_verdicts"),
             Self::Reputations => f.write_str("reputations"),
@@ -136,6 +140,7 @@ mod tests {
         for topic in [
             Topic::Detections(node.clone()),
             Topic::VoteDetections(node.clone()),
+            Topic::Boxes(node.clone()),
             Topic::GlobalDetections,
             Topic::GlobalVerdicts,
             Topic::Reputations,

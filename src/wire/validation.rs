@@ -12,9 +12,9 @@ use super::{
     CellDescription, CellMap, CellReputation, Encoding, FieldOfView, FusedObject, GlobalMap,
     LandmarkState, LedgerShare, MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus,
     ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations,
-    SCHEMA_VERSION, Trouble, Verdict, Verdicts,
+    SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose,
 };
-use crate::model::geometry::Covariance;
+use crate::model::geometry::{Covariance, HEADING_BOUND_RAD};
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
@@ -78,7 +78,7 @@ const VARIANCE_BOUND_M2: f64 = (1u128 << 66) as f64;
 /// encoding rounds up.
 const COUNT_BOUND: f64 = (1u64 << 52) as f64;
 
-/// Largest angle in radians: headings may count full turns.
+/// Largest angle in radians; the headings of objects may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
 /// Maximum yaw rate of a frame, far above any vehicle's yaw rate.
@@ -214,18 +214,7 @@ impl ObjectReport {
                 return Err(of(field)(RejectReason::TooManyObjects));
             }
         }
-        if let Some(pose) = self.pose {
-            check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
-            check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
-            check_between(pose.heading_rad, f64::MIN, f64::MAX).map_err(of("pose.heading_rad"))?;
-            let check = |value: Option<f64>, low, high| {
-                value.map_or(Ok(()), |value| check_between(value, low, high))
-            };
-            check(pose.height_m, 0.0, SIZE_BOUND_M).map_err(of("pose.height_m"))?;
-            check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)
-                .map_err(of("pose.pitch_rad"))?;
-            check(pose.roll_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.roll_rad"))?;
-        }
+        self.pose.as_ref().map_or(Ok(()), check_pose)?;
         self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
         let check_yaw_rate =
             |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
@@ -247,6 +236,26 @@ impl ObjectReport {
         }
         Ok(())
     }
+}
+
+/// Checks the pose of a report.
+pub(super) fn check_pose(pose: &WirePose) -> Result<(), InvalidValue> {
+    let of = |field: &'static str| {
+        move |reason| InvalidValue {
+            field: field.to_owned(),
+            reason,
+        }
+    };
+    check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
+    check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
+    check_between(pose.heading_rad, -HEADING_BOUND_RAD, HEADING_BOUND_RAD)
+        .map_err(of("pose.heading_rad"))?;
+    let check = |value: Option<f64>, low, high| {
+        value.map_or(Ok(()), |value| check_between(value, low, high))
+    };
+    check(pose.height_m, 0.0, SIZE_BOUND_M).map_err(of("pose.height_m"))?;
+    check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.pitch_rad"))?;
+    check(pose.roll_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.roll_rad"))
 }
 
 impl PerceivedObject {
@@ -588,7 +597,7 @@ fn check_scores(scores: &BTreeMap<Label, f64>) -> Result<(), RejectReason> {
     check_labels(scores.keys().map(|label| &**label))
 }
 
-fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
+pub(super) fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
     match value {
         _ if (low..=high).contains(&value) => Ok(()),
         _ if value.is_finite() => Err(RejectReason::OutOfRange),
@@ -631,7 +640,7 @@ fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
     }
 }
 
-fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
+pub(super) fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
     match confidence {
         0.0..=1.0 => Ok(()),
         _ if confidence.is_finite() => Err(RejectReason::ConfidenceOutOfRange),
@@ -639,7 +648,9 @@ fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
     }
 }
 
-fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), RejectReason> {
+pub(super) fn check_labels<'a>(
+    labels: impl IntoIterator<Item = &'a str>,
+) -> Result<(), RejectReason> {
     if labels.into_iter().all(is_label) {
         Ok(())
     } else {

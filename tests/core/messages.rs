@@ -9,11 +9,11 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, CellMap, CellReputation, ClientRefusal, ClientRefusals, ContentHash,
-    DescriptionStatus, FieldOfView, ForeignVotes, FusedObject, GlobalMap, LabelReading,
-    LandmarkState, LedgerEntry, LedgerMark, LedgerShare, LedgerSignature, NeighbourObject,
-    NodeState, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, Reputation, Reputations,
-    Role, Trouble, Verdict, Verdicts, WirePose,
+    BoxCamera, BoxReport, CellDescription, CellMap, CellReputation, ClientRefusal, ClientRefusals,
+    ContentHash, DescriptionStatus, FieldOfView, ForeignVotes, FusedObject, GlobalMap,
+    LabelReading, LandmarkState, LedgerEntry, LedgerMark, LedgerShare, LedgerSignature,
+    NeighbourObject, NodeState, NodeStatus, ObjectReport, PerceivedObject, PixelBox,
+    PoseCorrection, Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -141,6 +141,48 @@ fn report() {
             clock_error_us: Some(1500),
             frame_yaw_rate_radps: Some(0.1),
             moving: Some(true),
+        },
+    );
+}
+
+#[test]
+fn box_report() {
+    check(
+        "box_report",
+        &BoxReport {
+            schema: 1,
+            node: name("euclid--yolo"),
+            seq: 42,
+            captured_at_us: AT,
+            pose: WirePose {
+                height_m: Some(1.3),
+                pitch_rad: Some(0.07),
+                ..WirePose::new(1.0, 6.0, -1.57)
+            },
+            camera: BoxCamera {
+                width_px: 640,
+                height_px: 480,
+                fx: Some(500.0),
+                fy: Some(501.0),
+                cx: Some(320.0),
+                cy: Some(240.0),
+                distortion: vec![-0.1, 0.01, 0.0, 0.0],
+                pixel_sigma_px: Some(2.0),
+                heading_sigma_rad: Some(0.02),
+                tilt_sigma_rad: Some(0.01),
+                height_sigma_m: Some(0.05),
+                position_sigma_m: Some(0.1),
+                ..BoxCamera::default()
+            },
+            boxes: vec![PixelBox {
+                label: "person".into(),
+                confidence: 0.93,
+                x_min: 300.0,
+                y_min: 120.5,
+                x_max: 340.0,
+                y_max: 260.0,
+            }],
+            moving: Some(false),
         },
     );
 }
@@ -342,6 +384,7 @@ fn client_refusals() {
 #[test]
 fn every_message_has_a_snapshot() {
     let tested = [
+        "BoxReport",
         "CellDescription",
         "CellMap",
         "CellReputation",

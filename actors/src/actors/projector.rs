@@ -244,7 +244,7 @@ impl ProjectorState {
             self.troubles.note(TroubleKind::MountMismatch, &cause);
         }
         if self.algorithms.vote() {
-            self.publish(ReportKind::VoteDetections, votes(&report));
+            self.publish(ReportKind::VoteDetections, report.votes());
         }
         if self.algorithms.pace() {
             self.publish(ReportKind::Detections, report);
@@ -271,30 +271,5 @@ impl ProjectorState {
             kind,
             report: Arc::new(report),
         });
-    }
-}
-
-/// The report in the form that VOTE needs: only objects at landmarks.
-pub fn votes(report: &ObjectReport) -> ObjectReport {
-    let objects = report
-        .objects
-        .iter()
-        .filter(|object| object.landmark.is_some())
-        .cloned()
-        .collect();
-    let ObjectReport {
-        node,
-        seq,
-        captured_at_us,
-        pose,
-        clock_error_us,
-        ..
-    } = report;
-    let empty = ObjectReport::new(node.clone(), *seq, *captured_at_us);
-    ObjectReport {
-        pose: *pose,
-        objects,
-        clock_error_us: *clock_error_us,
-        ..empty
     }
 }

@@ -7,6 +7,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
+use ecod::perception::distortion::Distortion;
 use opencv::core::{
     Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector,
 };
@@ -16,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::frame_source::images;
 use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
-use crate::camera::lens::{Distortion, Lens};
+use crate::camera::lens::Lens;
 use crate::platform::bounded_file;
 
 /// Minimum number of photographs that show the whole board.

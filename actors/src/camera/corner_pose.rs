@@ -5,8 +5,6 @@ use nalgebra::{Point2, Point3};
 use opencv::calib3d::{self, SolvePnPMethod};
 use opencv::core::{Mat, MatTraitConstManual, Matx33d, Point2d, Point3d, Vector};
 
-use crate::camera::lens::camera_matrix;
-
 /// Error of locating a target.
 #[derive(Debug, thiserror::Error)]
 pub enum CornerPoseError {
@@ -48,6 +46,12 @@ fn perturbed(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
         third,
         fourth,
     ]
+}
+
+/// The intrinsics as OpenCV's 3×3 camera matrix.
+pub(crate) fn camera_matrix(intrinsics: &Intrinsics) -> Matx33d {
+    let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
+    Matx33d::from_array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
 }
 
 fn solve(

@@ -1,15 +1,11 @@
 //! Intrinsics and lens distortion of a camera, and the undistortion of detections.
 
-use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::detection::Detection;
 use ecod::perception::camera::Intrinsics;
+use ecod::perception::distortion::{Distortion, undistort, undistorted};
 use nalgebra::Point2;
-use opencv::calib3d;
-use opencv::core::{Mat, Matx33d, Point2d, Vector};
 
 use crate::camera::image_size::{ImageSize, SizeMismatch};
-
-/// OpenCV's k1, k2, p1, p2, k3, k4, k5, k6; the last three are 0 unless the model is rational.
-pub type Distortion = [f64; 8];
 
 /// A calibrated camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -103,88 +99,27 @@ impl Lens {
         })
     }
 
-    /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
-    ///
-    /// # Errors
-    /// Returns OpenCV's error.
-    pub fn undistort(&self, detections: &mut [Detection]) -> opencv::Result<()> {
-        if self.distortion.is_none() {
-            return Ok(());
+    /// Undistorts boxes and corners.
+    pub fn undistort(&self, detections: &mut [Detection]) {
+        if let Some(distortion) = &self.distortion {
+            for detection in detections {
+                undistort(detection, &self.intrinsics, distortion);
+            }
         }
-        let mut points = Vec::new();
-        for Detection {
-            bounding_box: b,
-            corners,
-            ..
-        } in detections.iter()
-        {
-            let middle = b.center();
-            let edges = [
-                (b.x_min, middle.y),
-                (b.x_max, middle.y),
-                (middle.x, b.y_min),
-                (middle.x, b.y_max),
-            ];
-            points.extend(edges.map(|(x, y)| Point2::new(x, y)));
-            points.extend(corners.iter().flatten());
-        }
-        let mut straight = self.undistorted(&points)?.into_iter();
-        let mut next = || straight.next().unwrap_or_default();
-        for detection in detections {
-            let [left, right, upper, lower] = std::array::from_fn(|_| next());
-            detection.bounding_box = BoundingBox {
-                x_min: left.x,
-                y_min: upper.y,
-                x_max: right.x,
-                y_max: lower.y,
-            };
-            detection
-                .corners
-                .iter_mut()
-                .flatten()
-                .for_each(|corner| *corner = next());
-        }
-        Ok(())
     }
 
-    /// Undistorts points.
-    ///
-    /// # Errors
-    /// Returns OpenCV's error.
-    pub fn undistorted(&self, points: &[Point2<f64>]) -> opencv::Result<Vec<Point2<f64>>> {
-        let Some(distortion) = self.distortion.filter(|_| !points.is_empty()) else {
-            return Ok(points.to_vec());
-        };
-        let points: Vector<Point2d> = points
-            .iter()
-            .map(|point| Point2d::new(point.x, point.y))
-            .collect();
-        let camera = camera_matrix(&self.intrinsics);
-        let mut straight = Vector::<Point2d>::new();
-        let distortion = Vector::<f64>::from_slice(&distortion);
-        calib3d::undistort_points(
-            &points,
-            &mut straight,
-            &camera,
-            &distortion,
-            &Mat::default(),
-            &camera,
-        )?;
-        Ok(straight
-            .iter()
-            .map(|point| Point2::new(point.x, point.y))
-            .collect())
+    /// The pixel at which a lens without distortion would show the same point.
+    pub fn undistorted(&self, pixel: &Point2<f64>) -> Point2<f64> {
+        self.distortion.map_or(*pixel, |distortion| {
+            undistorted(pixel, &self.intrinsics, &distortion)
+        })
     }
-}
-
-/// The intrinsics as OpenCV's 3×3 camera matrix.
-pub(crate) fn camera_matrix(intrinsics: &Intrinsics) -> Matx33d {
-    let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
-    Matx33d::from_array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
 }
 
 #[cfg(test)]
 mod tests {
+    use ecod::model::detection::BoundingBox;
+
     use super::*;
 
     const DISTORTION: Distortion = [-0.3, 0.1, 0.001, -0.002, 0.0, 0.05, 0.02, 0.01];
@@ -238,10 +173,9 @@ mod tests {
             distortion: Some(DISTORTION),
             ..Lens::ideal(camera())
         }
-        .undistort(&mut detections)
-        .unwrap();
+        .undistort(&mut detections);
         for (straight, ideal) in detections[1].corners.unwrap().iter().zip(ideal) {
-            assert!((straight - ideal).norm() < 0.05, "{straight} {ideal}");
+            assert!((straight - ideal).norm() < 1e-6, "{straight} {ideal}");
         }
         assert_eq!(detections[0].bounding_box, detections[1].bounding_box);
         assert!(
@@ -304,7 +238,7 @@ mod tests {
             corners: None,
         }];
         let mut detections = seen.clone();
-        Lens::ideal(camera()).undistort(&mut detections).unwrap();
+        Lens::ideal(camera()).undistort(&mut detections);
         assert_eq!(detections, seen);
     }
 }

@@ -28,9 +28,6 @@ pub enum MeasuredPointsError {
     /// The picture does not have the shape of the lens.
     #[error(transparent)]
     Size(#[from] SizeMismatch),
-    /// OpenCV cannot remove the distortion.
-    #[error("opencv cannot remove the distortion of the lens")]
-    Distortion(#[from] opencv::Error),
     /// The points give no camera.
     #[error(transparent)]
     Fit(#[from] GroundFitError),
@@ -49,14 +46,12 @@ pub fn fit_mount_to_points(
 ) -> Result<GroundFit, MeasuredPointsError> {
     let lens = lens.of_frames(picture)?;
     let scale = f64::from(lens.intrinsics.width) / f64::from(picture.width);
-    let pixels: Vec<_> = points
+    let pixels = points
         .iter()
-        .map(|point| Point2::from(point.pixel) * scale)
-        .collect();
+        .map(|point| lens.undistorted(&(Point2::from(point.pixel) * scale)));
     let places = points
         .iter()
         .map(|point| vehicle.ahead_left(&point.position_m.into()).into());
-    let pixels = lens.undistorted(&pixels)?.into_iter();
     let points: Vec<_> = pixels
         .zip(places)
         .map(|(pixel, place)| GroundPoint { pixel, place })

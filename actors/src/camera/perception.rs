@@ -17,7 +17,6 @@ use ecod::perception::projection::{
 };
 use ecod::perception::view::{PosedCamera, ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
-use nalgebra::Point2;
 
 use crate::camera::corner_pose::locate_target;
 use crate::camera::lens::Lens;
@@ -167,9 +166,7 @@ impl Perception {
             .iter()
             .map(|detection| self.projection.cut(detection))
             .collect();
-        if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
-            tracing::warn!(%error, "cannot remove distortion");
-        }
+        self.vehicle_camera.lens.undistort(&mut detections);
         let boxes = detections.iter().zip(cuts.iter().copied());
         self.mount_off_rad = self.mount_check.take(boxes, captured_at, &self.projection);
         let all = detections.iter().zip(cuts).enumerate();
@@ -292,18 +289,8 @@ impl Perception {
             .validate()
             .map_err(|reason| self.discarded.count(reason.as_str(), &reason))
             .ok()?;
-        Some(self.with_landmark(placed))
-    }
-
-    /// Assigns the object to a landmark.
-    fn with_landmark(&self, object: PerceivedObject) -> PerceivedObject {
-        let landmarks = &self.vehicle_camera.landmarks;
-        let point = Point2::new(object.x_m, object.y_m);
-        let best = object
-            .covariance()
-            .and_then(|c| landmarks.best(&object.label, &point, &c, &self.gate));
-        let landmark = best.map(|best| landmarks.landmarks()[best.landmark].id.clone());
-        PerceivedObject { landmark, ..object }
+        let VehicleCamera { landmarks, .. } = &self.vehicle_camera;
+        Some(landmarks.assigned(placed, &self.gate))
     }
 }
 

@@ -3,10 +3,11 @@
 use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::model::geometry::Pose;
+use ecod::model::geometry::{HEADING_BOUND_RAD, Pose};
 use ecod::model::origin::{GeographicPose, StatedPose};
 use ecod::model::time::Timestamp;
 use ecod::wire::use_integers;
+use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -30,7 +31,8 @@ pub struct PoseConfig {
     /// Height above the ellipsoid in metres. Default: the height of the cell's origin.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
-    /// Heading in degrees, clockwise from true north. Default: not set.
+    /// Heading in degrees, clockwise from true north; replaces `heading_deg`. Without an `[origin]`,
+    /// the y axis of the cell's frame is north. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub azimuth_deg: Option<f64>,
     /// UDP address that receives poses from the vehicle's localisation. It replaces the keys above,
@@ -61,8 +63,17 @@ impl PoseConfig {
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
         check_range("heading_deg", self.heading_deg, -360.0, 360.0)?;
-        let StatedPose::OnEarth(pose) = self.stated() else {
-            return self.validate_in_map();
+        let stated = self.stated();
+        let replaced = match stated {
+            StatedPose::InMap(_) => return self.validate_in_map(),
+            StatedPose::ByCompass(_, azimuth_deg) => {
+                if self.heading_deg != 0.0 {
+                    let allowed = "absent beside `azimuth_deg`, which is the heading, clockwise from true north";
+                    return Err(ConfigError::new("heading_deg", self.heading_deg, allowed));
+                }
+                return check_range("azimuth_deg", azimuth_deg, -360.0, 360.0);
+            }
+            StatedPose::OnEarth(pose) => pose,
         };
         for (key, value) in [
             ("x_m", self.x_m),
@@ -75,7 +86,7 @@ impl PoseConfig {
                 return Err(ConfigError::new(key, value, allowed));
             }
         }
-        pose.validate()
+        replaced.validate()
     }
 
     /// Checks that a pose on Earth is complete.
@@ -114,6 +125,9 @@ impl PoseConfig {
                     azimuth_deg,
                 })
             }
+            (None, None, Some(azimuth_deg)) if self.height_m.is_none() => {
+                StatedPose::ByCompass(Point2::new(self.x_m, self.y_m), azimuth_deg)
+            }
             _ => StatedPose::InMap(Pose::new(self.x_m, self.y_m, self.heading_deg.to_radians())),
         }
     }
@@ -124,7 +138,8 @@ impl PoseConfig {
 struct PoseFix {
     x_m: f64,
     y_m: f64,
-    heading_rad: f64,
+    heading_rad: Option<f64>,
+    azimuth_deg: Option<f64>,
 }
 
 /// The time of a received pose.
@@ -146,6 +161,7 @@ const WORLD_M: f64 = 1e8;
 ///
 /// ```json
 /// {"x_m": 4.2, "y_m": -1.0, "heading_rad": 1.57, "captured_at_us": 1732154400000000}
+/// {"x_m": 4.2, "y_m": -1.0, "azimuth_deg": 0.0}
 /// {"latitude_deg": 52.2296756, "longitude_deg": 21.0122287, "azimuth_deg": 90.0}
 /// ```
 ///
@@ -173,33 +189,50 @@ pub fn read_pose(
     let pose = if is_on_earth {
         on_earth(&fix).map(StatedPose::OnEarth)
     } else {
-        in_map(&fix).map(StatedPose::InMap)
+        in_map(&fix)
     };
     Ok((captured_at.unwrap_or(now), pose?))
 }
 
 fn on_earth(fix: &Value) -> Result<GeographicPose, String> {
     let pose = GeographicPose::deserialize(fix).map_err(|error| error.to_string())?;
+    pose.validate().map_err(in_words)?;
+    Ok(pose)
+}
+
+fn in_map(fix: &Value) -> Result<StatedPose, String> {
+    let PoseFix {
+        x_m,
+        y_m,
+        heading_rad,
+        azimuth_deg,
+    } = PoseFix::deserialize(fix).map_err(|error| error.to_string())?;
+    check_range("x_m", x_m, -WORLD_M, WORLD_M).map_err(in_words)?;
+    check_range("y_m", y_m, -WORLD_M, WORLD_M).map_err(in_words)?;
+    match (heading_rad, azimuth_deg) {
+        (Some(heading_rad), None) if heading_rad.abs() <= HEADING_BOUND_RAD => {
+            Ok(StatedPose::InMap(Pose::new(x_m, y_m, heading_rad)))
+        }
+        (Some(heading_rad), None) => Err(format!(
+            "`heading_rad`: {heading_rad} is beyond 2π; a heading is in radians, counter-clockwise from east: is this one \
+             in degrees?"
+        )),
+        (None, Some(azimuth_deg)) => {
+            check_range("azimuth_deg", azimuth_deg, -360.0, 360.0).map_err(in_words)?;
+            Ok(StatedPose::ByCompass(Point2::new(x_m, y_m), azimuth_deg))
+        }
+        _ => Err("a pose has either `heading_rad` or `azimuth_deg`".to_owned()),
+    }
+}
+
+/// The error of a received value, which is no key of the configuration.
+fn in_words(error: ConfigError) -> String {
     let ConfigError {
         key,
         value,
         allowed,
-    } = match pose.validate() {
-        Ok(()) => return Ok(pose),
-        Err(error) => error,
-    };
-    Err(format!(
-        "`{key}`: {value} is not allowed, must be {allowed}"
-    ))
-}
-
-fn in_map(fix: &Value) -> Result<Pose, String> {
-    let fix = PoseFix::deserialize(fix).map_err(|error| error.to_string())?;
-    let within = |value: f64, most: f64| value.abs() <= most;
-    if !within(fix.x_m, WORLD_M) || !within(fix.y_m, WORLD_M) || !within(fix.heading_rad, 1e3) {
-        return Err(format!("{fix:?} is not in this world"));
-    }
-    Ok(Pose::new(fix.x_m, fix.y_m, fix.heading_rad))
+    } = error;
+    format!("`{key}`: {value} is not allowed, must be {allowed}")
 }
 
 #[cfg(test)]
@@ -244,10 +277,38 @@ mod tests {
     }
 
     #[test]
+    fn a_pose_in_metres_may_have_the_heading_of_a_compass() {
+        let south = StatedPose::ByCompass(Point2::new(1.0, 6.0), 180.0);
+        let told = read_pose(br#"{"x_m":1,"y_m":6,"azimuth_deg":180}"#, Timestamp(7), 0);
+        assert_eq!(told, Ok((Timestamp(7), south)));
+        let configured: PoseConfig = toml::from_str("x_m = 1\ny_m = 6\nazimuth_deg = 180").unwrap();
+        assert_eq!(configured.validate(), Ok(()));
+        assert_eq!(configured.stated(), south);
+        let both: PoseConfig = toml::from_str("azimuth_deg = 180\nheading_deg = 90").unwrap();
+        let error = both.validate().unwrap_err().to_string();
+        assert!(
+            error.contains("`heading_deg`: 90 is not allowed"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn what_is_no_pose_is_refused_with_a_reason() {
         for (datagram, reason) in [
             (&b"{\"x_m\":1,\"y_m\":2}"[..], "heading_rad"),
-            (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "world"),
+            (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "`x_m`: 1e12"),
+            (
+                b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":-90}",
+                "`heading_rad`: -90 is beyond 2",
+            ),
+            (
+                b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"azimuth_deg\":90}",
+                "either `heading_rad` or `azimuth_deg`",
+            ),
+            (
+                b"{\"x_m\":1,\"y_m\":2,\"azimuth_deg\":400}",
+                "`azimuth_deg`: 400",
+            ),
             (
                 b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}",
                 "invalid value",

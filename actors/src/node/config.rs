@@ -22,6 +22,7 @@ use ecod::leadership::election::ElectionConfig;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::perception::landmark::{Landmark, LandmarkConfig};
+use ecod::perception::projection::NEURAL_PIXEL_SIGMA_PX;
 use ecod::wire::Role;
 use figment::providers::{Format, Serialized, Toml};
 use figment::value::{Dict, Map};
@@ -290,7 +291,7 @@ impl NodeConfig {
         {
             defaults = defaults.merge(Serialized::default(
                 "camera.projection.pixel_sigma_px",
-                COCO_PIXEL_SIGMA_PX,
+                NEURAL_PIXEL_SIGMA_PX,
             ));
         }
         #[cfg_attr(
@@ -461,9 +462,6 @@ impl NodeConfig {
         self.landmarks.iter().map(Landmark::from).collect()
     }
 }
-
-/// Default standard deviation in pixels of the edges of boxes that the detector of COCO gives.
-const COCO_PIXEL_SIGMA_PX: f64 = 3.0;
 
 /// The machine's name without its domain, limited to characters that are allowed in names of nodes.
 fn host_name() -> Option<NodeName> {

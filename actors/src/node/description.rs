@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use ecod::perception::box_projection::BoxProjector;
+use ecod::perception::landmark::LandmarkIndex;
 use ecod::vote::VoteMode;
 use ecod::wire::{CellDescription, DescriptionStatus, Limits, Payload, SCHEMA_VERSION};
 
@@ -130,10 +132,23 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
         round_period_s: config.fusion.round.period_s,
         algorithms: config.fusion.algorithms,
         landmarks: config.landmarks.clone().into(),
+        boxes: box_projector(config, held),
         has_origin: config.origin.is_some(),
         contradicts: held.problem.is_some(),
         problem: held.problem.clone().or_else(|| pose_problem(config)),
     }
+}
+
+/// The projection of the boxes of programs: objects have the sizes of the node's own camera, or
+/// without a camera the sizes of the description.
+fn box_projector(config: &NodeConfig, held: &HeldDescription) -> Arc<BoxProjector> {
+    let described = held.description.as_ref().filter(|_| held.problem.is_none());
+    let gate = config.fusion.pace.gate();
+    Arc::new(BoxProjector {
+        sizes: config.object_sizes(described.map(|description| &*description.text)),
+        landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
+        gate,
+    })
 }
 
 /// The reason why the frames of the node's camera have no place in the cell's frame.

@@ -12,6 +12,7 @@ use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
+use ecod::perception::box_projection::BoxProjector;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
 use ecod::wire::{Trouble, Verdicts};
@@ -54,7 +55,7 @@ pub struct Vitals {
 }
 
 /// Settings that the nodes of a cell share, as far as pages and readiness use them.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct SharedFacts {
     /// Maximum age of the newest round of a live aggregator; `None` if rounds arrive only with
     /// reports.
@@ -65,6 +66,8 @@ pub struct SharedFacts {
     pub algorithms: Algorithms,
     /// The cell's landmarks.
     pub landmarks: Arc<[LandmarkConfig]>,
+    /// Projects the boxes of programs.
+    pub boxes: Arc<BoxProjector>,
     /// True if the cell's frame has a place on Earth.
     pub has_origin: bool,
     /// True if the node does not use the cell's description.

@@ -295,6 +295,7 @@ fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
     match reason {
         Reason::NotCandidate
         | Reason::NotElected
+        | Reason::NotPlaced
         | Reason::OutOfOrder
         | Reason::Stale
         | Reason::Superseded

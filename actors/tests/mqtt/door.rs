@@ -1,5 +1,6 @@
 //! Programs beside nodes: whoever leads, each takes part in the cell at its own node's broker.
 
+mod boxes;
 mod cell;
 mod certificates;
 mod courses;

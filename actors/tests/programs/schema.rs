@@ -56,6 +56,7 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
     let kinds = [
         Topic::Detections(node.clone()),
         Topic::VoteDetections(node.clone()),
+        Topic::Boxes(node.clone()),
         Topic::GlobalDetections,
         Topic::GlobalVerdicts,
         Topic::Reputations,

@@ -11,7 +11,6 @@ use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{ObjectReport, RejectReason, ReportKind};
-use ecod_actors::actors::projector::votes;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
 use ecod_actors::camera::frame::CameraFrame;
@@ -195,7 +194,7 @@ fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<F
     for report in &reports {
         let (node, captured_at) = (&report.node, report.captured_at_us);
         for (kind, report) in [
-            (ReportKind::VoteDetections, votes(report)),
+            (ReportKind::VoteDetections, report.votes()),
             (ReportKind::Detections, report.clone()),
         ] {
             match aggregator.report(kind, &Arc::new(report), captured_at) {

@@ -5,6 +5,7 @@ use proptest::option;
 use proptest::prelude::*;
 
 use super::*;
+use crate::model::geometry::HEADING_BOUND_RAD;
 use crate::tracking::TracksConfig;
 use crate::wire::{Encoding, FieldOfView, Limits, Payload, WirePose, decode_entries, encode};
 
@@ -57,7 +58,7 @@ prop_compose! {
 prop_compose! {
     fn extreme_report()(
         objects in vec(object(), 1..5),
-        pose in option::of((number(1e8), number(1e8), number(1e6))),
+        pose in option::of((number(1e8), number(1e8), -HEADING_BOUND_RAD..=HEADING_BOUND_RAD)),
         view in option::of((positive(102_400.0), positive(1e6))),
         frame_yaw_rate_radps in option::of(number(100.0)),
         moving in option::of(any::<bool>()),

@@ -292,3 +292,20 @@ proptest! {
         prop_assert!((origin.to_map(&there) - Point3::new(x, y, z)).norm() < TOLERANCE_M);
     }
 }
+
+#[test]
+fn a_compass_heading_is_clockwise_from_true_north_also_in_a_rotated_frame() {
+    let south = StatedPose::ByCompass(Point2::new(1.0, 6.0), 180.0);
+    let rotated = GeographicOrigin {
+        rotation_deg: 30.0,
+        ..at(52.2296756, 21.0122287, 113.0)
+    };
+    for (origin, heading_deg) in [(None, -90.0f64), (Some(&rotated), -120.0)] {
+        let pose = south.in_map(origin).unwrap();
+        assert!(
+            (pose.heading_rad - heading_deg.to_radians()).abs() < 1e-12,
+            "{pose:?}"
+        );
+        assert_eq!(pose.position, Point2::new(1.0, 6.0));
+    }
+}

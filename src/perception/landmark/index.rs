@@ -9,6 +9,7 @@ use super::Landmark;
 use super::grid::{Grid, GridPoint};
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, LandmarkId};
+use crate::wire::PerceivedObject;
 
 /// Landmarks in configuration order with a spatial index of the positions of objects and vacancy
 /// signs.
@@ -143,6 +144,18 @@ impl LandmarkIndex {
                 _ => Some(candidate),
             },
         )
+    }
+
+    /// The object with the landmark that [`Self::best`] finds for it. An object without a covariance
+    /// belongs to none.
+    #[must_use]
+    pub fn assigned(&self, object: PerceivedObject, gate: &LandmarkGate) -> PerceivedObject {
+        let point = Point2::new(object.x_m, object.y_m);
+        let best = object
+            .covariance()
+            .and_then(|covariance| self.best(&object.label, &point, &covariance, gate));
+        let landmark = best.map(|best| self.landmarks[best.landmark].id.clone());
+        PerceivedObject { landmark, ..object }
     }
 
     /// All landmarks within the gate of a detection, as for [`Self::best`], in no particular order.

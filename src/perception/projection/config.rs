@@ -8,6 +8,9 @@ use super::coco_sizes;
 use crate::config::{ConfigError, check_range, config_section};
 use crate::model::names::Label;
 
+/// Standard deviation in pixels of a box edge of a neural detector.
+pub const NEURAL_PIXEL_SIGMA_PX: f64 = 3.0;
+
 /// The method of finding the distance of a detection.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -91,11 +91,11 @@ pub fn fit_board(
     };
     let size = lens.intrinsics;
     let scale = f64::from(size.width) / f64::from(photograph.cols());
-    let scaled: Vec<_> = pixels
+    let straight: Vec<_> = pixels
         .iter()
-        .map(|pixel| Point2::from(pixel.coords * scale))
+        .map(|pixel| lens.undistorted(&Point2::from(pixel.coords * scale)))
         .collect();
-    fit(&lens.undistorted(&scaled)?, &places, &size)
+    fit(&straight, &places, &size)
 }
 
 /// The fit to a board, whose corners may count from either side of it.

@@ -9,7 +9,7 @@ use opencv::calib3d::{self, SolvePnPMethod};
 use opencv::core::{Mat, MatTraitConstManual, Matx33d, Point2d, Point3d, Vector};
 use serde::Serialize;
 
-use crate::camera::lens::camera_matrix;
+use crate::camera::corner_pose::camera_matrix;
 
 /// A point on the ground, and where it is in the image.
 #[derive(Debug, Clone, Copy, PartialEq)]

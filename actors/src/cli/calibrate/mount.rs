@@ -494,7 +494,7 @@ impl Watched {
         );
         detections
             .retain(|person| person.label == label && projection.cut(person) == Cut::default());
-        self.lens.undistort(&mut detections)?;
+        self.lens.undistort(&mut detections);
         self.people.push(
             detections
                 .iter()

@@ -473,7 +473,7 @@ impl NodeBuilder {
         let (leadership, members) = (self.leadership(), self.members());
         let credentials = self.security.credentials.clone();
         let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
-        let shared = self.shared.subscribe();
+        let (shared, to_project) = (self.shared.subscribe(), self.shared.subscribe());
         let (may_lead, to_dismiss) = (self.config.may_lead(), self.live_state());
         let (gateway, to_watch, live_state) = (
             self.slots.gateway.clone(),
@@ -495,6 +495,10 @@ impl NodeBuilder {
             }),
             is_member: Arc::new(move |name| {
                 members.borrow().iter().any(|member| member.name == *name)
+            }),
+            project: Arc::new(move |report| {
+                let boxes = Arc::clone(&to_project.borrow().boxes);
+                boxes.project(report)
             }),
             report: Arc::new(move |kind, report| {
                 gateway.send(GatewayMessage::PublishReport { kind, report });

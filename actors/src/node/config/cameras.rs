@@ -5,6 +5,8 @@ use ecod::admission::report_window::MAX_PARTS;
 #[cfg(feature = "camera")]
 use ecod::config::ConfigError;
 #[cfg(feature = "camera")]
+use ecod::perception::projection::NEURAL_PIXEL_SIGMA_PX;
+#[cfg(feature = "camera")]
 use figment::Figment;
 
 use super::NodeConfig;
@@ -25,7 +27,7 @@ impl NodeConfig {
                 .get("projection")
                 .is_some_and(|projection| projection.get("pixel_sigma_px").is_some());
             if matches!(camera.detector, DetectorConfig::Coco(_)) && !is_stated {
-                camera.projection.pixel_sigma_px = super::COCO_PIXEL_SIGMA_PX;
+                camera.projection.pixel_sigma_px = NEURAL_PIXEL_SIGMA_PX;
             }
         }
     }

@@ -213,14 +213,7 @@ impl SharedConfig {
 
     /// The shared settings of a node's configuration.
     fn of(config: &NodeConfig) -> Self {
-        #[cfg(feature = "camera")]
-        let sizes = config
-            .all_cameras()
-            .next()
-            .map(|camera| camera.projection.sizes.clone())
-            .unwrap_or_default();
-        #[cfg(not(feature = "camera"))]
-        let sizes = ObjectSizes::default();
+        let sizes = config.object_sizes(None);
         Self {
             fusion: config.fusion.clone(),
             landmarks: config.landmarks.clone(),
@@ -258,6 +251,19 @@ impl SharedConfig {
 }
 
 impl NodeConfig {
+    /// True sizes of objects: those of the first camera, which a description has overlaid, or
+    /// without a camera those of the text of a description.
+    pub(in crate::node) fn object_sizes(&self, description: Option<&str>) -> ObjectSizes {
+        #[cfg(feature = "camera")]
+        if let Some(camera) = self.all_cameras().next() {
+            return camera.projection.sizes.clone();
+        }
+        let described = description.and_then(|text| SharedConfig::parse(text).ok());
+        described.map_or_else(ObjectSizes::default, |shared| {
+            shared.camera.projection.sizes
+        })
+    }
+
     /// The configuration with the values of a cell's description.
     ///
     /// # Errors

@@ -5,6 +5,7 @@
 //! Follower, Gateway ── what the node accepted ──> Door ──> `$door/` + topic ──> programs
 //! program ── SUBSCRIBE a filter ────────────────> `$door/` + filter
 //! program ── report in the node's name ─────────> checked ──> Gateway ──> leader, standby, this node
+//! program ── boxes ───> projected to a report ──> Gateway, or this broker for a vehicle without a node
 //! ```
 //!
 //! The brokers of leader and standby also carry the raw messages of all nodes. Programs have their
@@ -24,9 +25,10 @@ use bytes::Bytes;
 use ecod::admission::recent_reports::RecentReports;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::perception::box_projection::ProjectedBoxes;
 use ecod::wire::{
-    CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations,
-    Topic, Topics, encode,
+    BoxReport, CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind,
+    Reputations, Topic, Topics, encode,
 };
 use rmqtt::context::ServerContext;
 use rmqtt::session::SessionState;
@@ -35,10 +37,10 @@ use tokio::sync::mpsc;
 
 use self::refusals::Refusals;
 use crate::platform::clock;
-use crate::platform::throttle::TokenBucket;
+use crate::platform::throttle::{KeyedThrottle, TokenBucket};
 use crate::telemetry::counters::{Counters, Event};
 
-pub(super) use self::programs::{DoorHooks, TopicPlace};
+pub(super) use self::programs::{BoxRoute, DoorHooks, TopicPlace};
 pub(super) use self::refusals::DoorRefusal;
 
 /// The node of a local broker, and its connections to the cell.
@@ -64,6 +66,8 @@ pub struct DoorSetup {
     pub fuses: Arc<dyn Fn(ReportKind) -> bool + Send + Sync>,
     /// True if another node has this name.
     pub is_member: Arc<dyn Fn(&NodeName) -> bool + Send + Sync>,
+    /// Projects the boxes in a program's image.
+    pub project: Arc<dyn Fn(&BoxReport) -> ProjectedBoxes + Send + Sync>,
     /// Processes a program's report for the cell.
     pub report: Arc<dyn Fn(ReportKind, Arc<ObjectReport>) + Send + Sync>,
     /// Sets the cell's description, given as TOML, or returns the reason for refusing it.
@@ -95,6 +99,8 @@ struct DoorState {
     watches_reports: AtomicBool,
     recent_reports: Mutex<RecentReports>,
     throttles: [Mutex<TokenBucket>; ReportKind::COUNT],
+    /// Limits the boxes of vehicles without a node.
+    nodeless_boxes: Mutex<KeyedThrottle<NodeName>>,
     descriptions: Mutex<TokenBucket>,
     /// Parts of the node that report, and when they last did.
     parts: Mutex<BTreeMap<NodeName, Timestamp>>,
@@ -103,8 +109,9 @@ struct DoorState {
     refusals: Mutex<Refusals>,
 }
 
-/// A message for programs.
+/// A message that the broker itself publishes.
 struct Publication {
+    place: TopicPlace,
     topic: String,
     payload: Bytes,
     retain: bool,
@@ -144,6 +151,7 @@ impl Door {
                 DESCRIPTION_INTERVAL,
                 now,
             )),
+            nodeless_boxes: Mutex::new(KeyedThrottle::per_second(setup.max_report_hz)),
             setup,
             queue: Mutex::default(),
             retained: Mutex::default(),
@@ -229,11 +237,12 @@ impl Door {
             None,
         ));
         let publish = async |Publication {
+                                 place,
                                  topic,
                                  payload,
                                  retain,
                              }| {
-            let topic = TopicPlace::Door.topic(&topic).into();
+            let topic = place.topic(&topic).into();
             let (qos, properties) = (QoS::AtMostOnce, None);
             let packet = CodecPublish {
                 dup: false,
@@ -252,6 +261,7 @@ impl Door {
         };
         for (topic, payload) in before {
             publish(Publication {
+                place: TopicPlace::Door,
                 topic,
                 payload,
                 retain: true,
@@ -282,6 +292,7 @@ impl DoorState {
     fn publication<T: Payload>(&self, topic: &Topic, payload: &T, retain: bool) -> Publication {
         let payload = encode(payload, self.setup.encoding).into();
         Publication {
+            place: TopicPlace::Door,
             topic: self.setup.topics.path(topic),
             payload,
             retain,
@@ -316,6 +327,7 @@ impl DoorState {
         let topic = lock(&self.unsent).pop_first()?;
         let payload = lock(&self.retained).get(&topic)?.clone();
         Some(Publication {
+            place: TopicPlace::Door,
             topic,
             payload,
             retain: true,

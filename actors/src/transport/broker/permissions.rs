@@ -2,7 +2,7 @@
 //!
 //! | topic | may publish |
 //! |---|---|
-//! | `detections/N`, `detections/N--…`, `vote_detections/N`, `vote_detections/N--…` | the certificate of `N` |
+//! | `detections/N`, `vote_detections/N`, `boxes/N`, and each of a part `N--…` | the certificate of `N` |
 //! | `ledger/N` | the certificate of `N`, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
 //! | `cell` | nodes that may lead; receivers check which node set it |
@@ -27,7 +27,7 @@ use rmqtt::types::{
     TopicFilter,
 };
 
-use super::door::{Door, DoorRefusal, TopicPlace};
+use super::door::{BoxRoute, Door, DoorRefusal, TopicPlace};
 use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
 use crate::telemetry::counters::Counters;
 use crate::transport::mqtt::ENVELOPE_BYTES;
@@ -115,8 +115,17 @@ impl Permissions {
                 .map_err(DoorRefusal::not_permitted)?;
             return self.door.take(&principal, (place, topic), publish);
         }
-        let is_allowed = place == TopicPlace::Cell && self.allows(&principal, topic, retain, bytes);
-        is_allowed.then_some(()).ok_or_else(refused)
+        if place != TopicPlace::Cell || !self.allows(&principal, topic, retain, bytes) {
+            return Err(refused());
+        }
+        match self.policy.topics.parse(topic) {
+            // A vehicle without a node, by its certificate.
+            Some(Topic::Boxes(name)) => {
+                self.door
+                    .take_boxes(&name, BoxRoute::Broker, &publish.payload)
+            }
+            _ => Ok(()),
+        }
     }
 
     /// True if a principal may publish on a topic. Without certificates every topic is allowed,
@@ -256,7 +265,9 @@ impl Handler for Permissions {
 /// Largest payload that receivers of the topic accept, in bytes.
 fn max_bytes(topic: &Topic, limits: &Limits) -> usize {
     match topic {
-        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Ledger(_) => limits.payload_bytes,
+        Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Boxes(_) | Topic::Ledger(_) => {
+            limits.payload_bytes
+        }
         Topic::Nodes(_) => limits.payload_bytes.min(MAX_STATUS_BYTES),
         Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations => limits.map_bytes,
         Topic::Cell => limits.map_bytes.min(MAX_CELL_BYTES),
@@ -270,7 +281,9 @@ fn is_state(topic: &Topic) -> bool {
 
 fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderCheck) -> bool {
     match topic {
-        Topic::Detections(node) | Topic::VoteDetections(node) => identity.may_act_as(node.as_str()),
+        Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Boxes(node) => {
+            identity.may_act_as(node.as_str())
+        }
         Topic::Ledger(node) => identity.may_serve() && identity.name() == node,
         Topic::Nodes(node) => identity.may_act_as(node.as_str()),
         Topic::Cell => identity.may_serve(),

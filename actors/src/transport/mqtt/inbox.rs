@@ -159,6 +159,8 @@ impl Inbox {
                     received_at,
                 );
             }
+            // Brokers project boxes and publish the resulting report.
+            Topic::Boxes(_) => return Err(RejectReason::UnknownTopic),
             Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::Ledger(node) if node == self.node => return Ok(self.echo()),
             Topic::Ledger(node) => {
@@ -344,6 +346,7 @@ impl Inbox {
             Some(
                 Topic::Detections(node)
                 | Topic::VoteDetections(node)
+                | Topic::Boxes(node)
                 | Topic::Ledger(node)
                 | Topic::Nodes(node),
             ) => node.to_string(),

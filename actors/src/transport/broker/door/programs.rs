@@ -3,6 +3,7 @@
 //! | topic | a program of the node `euclid` |
 //! |---|---|
 //! | `detections/euclid`, `detections/euclid--…`, `vote_detections/…` | is forwarded to the cell |
+//! | `boxes/euclid`, `boxes/euclid--…` | is projected to a report, which is forwarded to the cell |
 //! | `cell` | is the cell's new description, if `euclid` may lead |
 //! | `nodes/euclid--…` | reaches the programs at this broker |
 //! | `nodes/<node>`, empty | dismisses that node, if it is missing and `euclid` may lead |
@@ -21,7 +22,11 @@ use bytes::Bytes;
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, Flaw, RejectReason, ReportKind, Topic, decode, decode_report};
+use ecod::perception::box_projection::ProjectedBoxes;
+use ecod::wire::{
+    CellDescription, Flaw, ObjectReport, RejectReason, ReportKind, Topic, decode, decode_boxes,
+    decode_report,
+};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
@@ -45,6 +50,15 @@ pub(in crate::transport::broker) enum TopicPlace {
     Door,
     /// From a program to the node; subscriptions don't match this place.
     Inbound,
+}
+
+/// The route by which a program's boxes, once they are projected, reach the cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::transport::broker) enum BoxRoute {
+    /// The node publishes them as reports of its own part.
+    Node,
+    /// They are reports of a vehicle without a node, and go to the clients of this broker.
+    Broker,
 }
 
 /// Prefixes of places. Filters with a leading wildcard do not match them.
@@ -129,9 +143,56 @@ impl Door {
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
                 Some(Topic::Cell) => door.take_description(principal, &publish.payload),
                 Some(Topic::Nodes(name)) => door.take_dismissal(principal, &name),
+                Some(Topic::Boxes(name)) => {
+                    let route = door.route(principal, &name)?;
+                    self.take_boxes(&name, route, &publish.payload)
+                }
                 _ => door.take_report(principal, topic, &publish.payload),
             },
         }
+    }
+
+    /// Projects a program's boxes, and passes the resulting reports to the cell. Boxes without a
+    /// position are left out and counted.
+    pub(in crate::transport::broker) fn take_boxes(
+        &self,
+        name: &NodeName,
+        route: BoxRoute,
+        payload: &Bytes,
+    ) -> Result<(), DoorRefusal> {
+        let Some(door) = self.0.as_deref() else {
+            let text = "this node places no boxes, because its `broker.door` is false";
+            return Err(DoorRefusal::not_permitted(text));
+        };
+        let setup = &door.setup;
+        let topic = Topic::Boxes(name.clone());
+        let now = clock::now();
+        match route {
+            BoxRoute::Node => door.check_rate(ReportKind::Detections, now)?,
+            BoxRoute::Broker => door.check_nodeless_rate(&name.vehicle(), now)?,
+        }
+        let boxes = decode_boxes(payload, name, &setup.limits).map_err(|flaw| {
+            let text =
+                format!("the report on {topic} is not usable: {flaw}; see docs/protocol.md#boxes");
+            DoorRefusal::new(RefusalReason::Rejected(flaw.reason), text)
+        })?;
+        if route == BoxRoute::Node {
+            door.check_part(name, now)?;
+        }
+        let ProjectedBoxes { report, unplaced } = (setup.project)(&boxes);
+        for unplaced in unplaced {
+            let text = format!("not on the map, {unplaced}");
+            let refusal = DoorRefusal::new(RefusalReason::Rejected(RejectReason::NotPlaced), text);
+            self.note_refusal(name.as_str(), &setup.topics.path(&topic), &refusal);
+        }
+        let votes = report.votes();
+        if (setup.fuses)(ReportKind::VoteDetections) && !votes.objects.is_empty() {
+            door.pass_on(ReportKind::VoteDetections, votes, route);
+        }
+        if (setup.fuses)(ReportKind::Detections) {
+            door.pass_on(ReportKind::Detections, report, route);
+        }
+        Ok(())
     }
 
     /// Counts and shows a refusal.
@@ -167,6 +228,7 @@ impl Door {
         if let Some(status) = status {
             let topic = setup.topics.clients(&setup.node);
             door.retain(Publication {
+                place: TopicPlace::Door,
                 topic,
                 payload: status.into(),
                 retain: true,
@@ -187,9 +249,9 @@ impl Door {
             }
             Some(Topic::Nodes(name)) if is_dismissal(&name, publish) => TopicPlace::Inbound,
             Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => TopicPlace::Cell,
-            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => {
-                TopicPlace::Inbound
-            }
+            Some(
+                Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Boxes(_) | Topic::Cell,
+            ) => TopicPlace::Inbound,
             _ => TopicPlace::Door,
         }
     }
@@ -223,7 +285,7 @@ impl DoorState {
                 Ok(())
             }
             _ => Err(DoorRefusal::not_permitted(format!(
-                "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
+                "programs do not publish {topic}; reports go to detections/{node}--<part>, vote_detections/{node}--<part> and boxes/{node}--<part>"
             ))),
         }
     }
@@ -244,24 +306,9 @@ impl DoorState {
                 )));
             }
         };
-        let node = &setup.node;
-        if name.vehicle() != *node
-            || !self.is_own(principal)
-            || (name != *node && (setup.is_member)(&name))
-        {
-            return Err(DoorRefusal::not_permitted(format!(
-                "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
-            )));
-        }
+        self.check_name(principal, &name)?;
         let now = clock::now();
-        let throttle = self.throttles.get(kind as usize);
-        if throttle.is_some_and(|throttle| !lock(throttle).allow(now)) {
-            let most = setup.max_report_hz / 2;
-            let text = format!(
-                "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz"
-            );
-            return Err(DoorRefusal::new(RefusalReason::Throttled, text));
-        }
+        self.check_rate(kind, now)?;
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
             let told = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
@@ -275,16 +322,84 @@ impl DoorState {
                 text,
             ));
         }
-        if !self.admits_part(&name, now) {
-            let text =
-                format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
-            return Err(DoorRefusal::new(
-                RefusalReason::Rejected(RejectReason::TooManyVehicles),
-                text,
-            ));
-        }
+        self.check_part(&name, now)?;
         (setup.report)(kind, Arc::new(report));
         Ok(())
+    }
+
+    /// Checks that a program may report under a name.
+    fn check_name(&self, principal: &Principal, name: &NodeName) -> Result<(), DoorRefusal> {
+        let node = &self.setup.node;
+        let is_allowed = name.vehicle() == *node
+            && self.is_own(principal)
+            && (name == node || !(self.setup.is_member)(name));
+        if is_allowed {
+            return Ok(());
+        }
+        Err(DoorRefusal::not_permitted(format!(
+            "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
+        )))
+    }
+
+    /// Checks the rate of the reports of all programs of the node together.
+    fn check_rate(&self, kind: ReportKind, now: Timestamp) -> Result<(), DoorRefusal> {
+        let throttle = self.throttles.get(kind as usize);
+        if throttle.is_none_or(|throttle| lock(throttle).allow(now)) {
+            return Ok(());
+        }
+        let (node, most) = (&self.setup.node, self.setup.max_report_hz / 2);
+        let text = format!(
+            "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz"
+        );
+        Err(DoorRefusal::new(RefusalReason::Throttled, text))
+    }
+
+    /// Checks the rate of the boxes of a vehicle without a node.
+    fn check_nodeless_rate(&self, vehicle: &NodeName, now: Timestamp) -> Result<(), DoorRefusal> {
+        if lock(&self.nodeless_boxes).allow(vehicle, now) {
+            return Ok(());
+        }
+        let most = self.setup.max_report_hz;
+        let text = format!(
+            "{vehicle} reports boxes more than {most} times a second, as mqtt.max_report_hz allows"
+        );
+        Err(DoorRefusal::new(RefusalReason::Throttled, text))
+    }
+
+    /// Checks that the aggregator has room for this part of the node, too.
+    fn check_part(&self, name: &NodeName, now: Timestamp) -> Result<(), DoorRefusal> {
+        if self.admits_part(name, now) {
+            return Ok(());
+        }
+        let node = &self.setup.node;
+        let text =
+            format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
+        Err(DoorRefusal::new(
+            RefusalReason::Rejected(RejectReason::TooManyVehicles),
+            text,
+        ))
+    }
+
+    /// The route of the reports that a program's boxes become.
+    fn route(&self, principal: &Principal, name: &NodeName) -> Result<BoxRoute, DoorRefusal> {
+        if self.is_nodeless(principal, name) {
+            return Ok(BoxRoute::Broker);
+        }
+        self.check_name(principal, name).map(|()| BoxRoute::Node)
+    }
+
+    /// Passes a report of projected boxes to the cell.
+    fn pass_on(&self, kind: ReportKind, report: ObjectReport, route: BoxRoute) {
+        match route {
+            BoxRoute::Node => (self.setup.report)(kind, Arc::new(report)),
+            BoxRoute::Broker => {
+                let topic = kind.topic(report.node.clone());
+                self.send(Publication {
+                    place: TopicPlace::Cell,
+                    ..self.publication(&topic, &report, false)
+                });
+            }
+        }
     }
 
     /// True if the certificate belongs to the node, or there are no certificates.
