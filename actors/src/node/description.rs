@@ -162,3 +162,38 @@ fn pose_problem(config: &NodeConfig) -> Option<String> {
 fn pose_problem(_config: &NodeConfig) -> Option<String> {
     None
 }
+
+#[cfg(test)]
+mod tests {
+    use ecod::model::names::NodeName;
+    use ecod::wire::Role;
+
+    use super::*;
+
+    #[test]
+    fn boxes_have_the_sizes_of_the_description_at_a_node_without_a_camera() {
+        let text = "[camera.projection.sizes.labels]\ncar = { width_m = 0.18, height_m = 0.12 }\n";
+        let set_by = NodeName::from_static("edge");
+        let mut held = HeldDescription {
+            description: Some(Arc::new(CellDescription {
+                schema: SCHEMA_VERSION,
+                version: 1,
+                hash: content_hash(&set_by, text),
+                set_by,
+                text: text.to_owned(),
+            })),
+            problem: None,
+        };
+        let config = NodeConfig {
+            role: Role::Edge,
+            ..NodeConfig::default()
+        };
+        let car_m = |held: &HeldDescription| {
+            let sizes = &shared_facts(&config, held).boxes.sizes;
+            sizes.of("car").map(|size| size.height_m)
+        };
+        assert_eq!(car_m(&held), Some(0.12));
+        held.problem = Some("contradicts".to_owned());
+        assert_eq!(car_m(&held), car_m(&HeldDescription::default()));
+    }
+}

@@ -67,13 +67,27 @@ def described(landmark: ecod.LandmarkState) -> str:
     return f"{landmark.id}: {landmark.label} {landmark.confidence:.2f}"
 
 
+def pose_of(place: Optional[list[float]], azimuth_deg: Optional[float]) -> Optional[ecod.Pose]:
+    """The pose given by --pose and --azimuth."""
+    if place is None and azimuth_deg is None:
+        return None
+    if place is None or len(place) != (3 if azimuth_deg is None else 2):
+        sys.exit("--pose takes X_M Y_M HEADING_DEG, or X_M Y_M with --azimuth DEG")
+    if azimuth_deg is not None:
+        return ecod.Pose.from_compass(place[0], place[1], azimuth_deg)
+    return ecod.Pose(place[0], place[1], math.radians(place[2]))
+
+
 def arguments() -> Any:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--broker", metavar="HOST:PORT", help="the leader's, or the cell's external one; default $ECOD_BROKER")
     parser.add_argument("--cell", help="default $ECOD_CELL")
     parser.add_argument("--node", required=True, help="name of this vehicle, unique in the cell")
     parser.add_argument("--part", default="", help="name of this program beside others of the vehicle")
-    parser.add_argument("--pose", nargs=3, type=float, metavar=("X_M", "Y_M", "HEADING_DEG"), help="where the camera is")
+    place = "metres east and north of the camera, and its heading in degrees counter-clockwise from east"
+    parser.add_argument("--pose", nargs="+", type=float, metavar="NUMBER", help=place)
+    compass = "heading in degrees clockwise from north, in place of the third number of --pose"
+    parser.add_argument("--azimuth", type=float, metavar="DEG", help=compass)
     parser.add_argument("--user", help="for a broker with passwords")
     parser.add_argument("--password", help="default $ECOD_MQTT__PASSWORD")
     parser.add_argument("--ca", metavar="FILE", help="whose certificates a broker must show; speaks TLS (PEM)")
@@ -85,8 +99,7 @@ def arguments() -> Any:
 
 def main() -> None:
     given = vars(arguments())
-    pose = given.pop("pose")
-    default_pose = ecod.Pose(pose[0], pose[1], math.radians(pose[2])) if pose else None
+    default_pose = pose_of(given.pop("pose"), given.pop("azimuth"))
     frames = unsent = 0
     with ecod.Cell(**given) as cell:
         for printer in (print_maps, print_verdicts):

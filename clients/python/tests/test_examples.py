@@ -59,6 +59,16 @@ def feed(broker: str, *arguments: str, cell: str = "lot-1", lines: list[str]) ->
         return process.returncode, out + err
 
 
+def test_a_heading_is_given_by_degrees_of_either_kind() -> None:
+    pose_of: Callable[..., Any] = runpy.run_path(str(EXAMPLES / "feed_detections.py"))["pose_of"]
+    assert pose_of(None, None) is None
+    for south in (pose_of([1.0, 6.0, -90.0], None), pose_of([1.0, 6.0], 180.0)):
+        assert (south.x_m, south.y_m, south.heading_rad) == pytest.approx((1.0, 6.0, -math.pi / 2))
+    for place, azimuth_deg in (([1.0, 6.0], None), ([1.0, 6.0, 90.0], 180.0), (None, 180.0)):
+        with pytest.raises(SystemExit, match="X_M Y_M with --azimuth DEG"):
+            pose_of(place, azimuth_deg)
+
+
 def leads(edge: Server, cell_name: str, **settings: Any) -> None:
     """Waits for the edge's first map."""
     with ecod.Cell(edge.address, cell_name, **settings) as cell:

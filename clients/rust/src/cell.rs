@@ -1,6 +1,6 @@
 //! A program's connection to a cell.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::env;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
@@ -10,8 +10,9 @@ use ecod::model::names::{LandmarkId, NodeName, PART_MARK};
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, Encoding, FieldOfView, GlobalMap, Limits, NodeStatus, ObjectReport,
-    PerceivedObject, ReportKind, Reputations, Topics, Verdicts, WirePose, encode,
+    BoxCamera, BoxReport, CellDescription, Encoding, FieldOfView, Flaw, GlobalMap, Limits,
+    NodeStatus, ObjectReport, PerceivedObject, PixelBox, ReportKind, Reputations, SCHEMA_VERSION,
+    Topic, Topics, Verdicts, WirePose, encode, encode_boxes,
 };
 use rumqttc::Transport;
 use rumqttc::v5::MqttOptions;
@@ -98,14 +99,30 @@ impl Frame {
     }
 }
 
+/// Boxes in one image. An image without boxes is a report, too.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BoxFrame {
+    /// Time of the image, not of the detection.
+    pub captured_at: SystemTime,
+    /// The boxes, in pixels of the image.
+    pub boxes: Vec<PixelBox>,
+    /// Size, optics and accuracy of the camera.
+    pub camera: BoxCamera,
+    /// Pose of the camera with its height, pitch and roll. For a camera on a vehicle,
+    /// [`Mount::stated_pose`](ecod::perception::camera::Mount::stated_pose) gives it.
+    pub pose: WirePose,
+    /// `Some(false)` for a camera that is fixed at the road and no object of the map.
+    pub moving: Option<bool>,
+}
+
 /// A connection to a cell, which is re-established whenever it is lost. Its methods may be called
 /// from any thread.
 pub struct Cell {
     name: NodeName,
     topics: Topics,
     shared: Arc<ConnectionState>,
-    /// Reports of each kind so far.
-    sent: Mutex<[u64; ReportKind::COUNT]>,
+    /// Number of reports on each topic so far.
+    sent: Mutex<HashMap<Topic, u64>>,
     timeout: Duration,
 }
 
@@ -299,6 +316,44 @@ impl Cell {
         self.send(ReportKind::Detections, frame)
     }
 
+    /// Reports the boxes of a detector in one image. The node at which the program is connected
+    /// places them on the map, as it does the boxes of its own camera.
+    ///
+    /// A box that gives no position, such as one above the horizon, is left out; the node counts it
+    /// as `not_placed`, and states the reason on `nodes/<node>/clients`. Returns as
+    /// [`Cell::report`] does.
+    ///
+    /// # Errors
+    /// Returns [`Error::Invalid`] for values that the protocol does not allow, such as a box outside
+    /// the image, and [`Error::Refused`] if the broker refused the login or earlier boxes, or is no
+    /// broker of a node and answers that nobody receives them.
+    pub fn report_boxes(&self, image: BoxFrame) -> Result<bool, Error> {
+        let BoxFrame {
+            captured_at,
+            boxes,
+            camera,
+            pose,
+            moving,
+        } = image;
+        let (number, captured_at_us) = (boxes.len(), micros(captured_at)?);
+        self.send_next(Topic::Boxes(self.name.clone()), number, |seq| {
+            let report = BoxReport {
+                schema: SCHEMA_VERSION,
+                node: self.name.clone(),
+                seq,
+                captured_at_us,
+                pose,
+                camera,
+                boxes,
+                moving,
+            };
+            report
+                .check(&Limits::default())
+                .map_err(|flaw| Error::Invalid(format!("not sent: {flaw}")))?;
+            Ok(encode_boxes(&report))
+        })
+    }
+
     /// Votes on the labels at landmarks, for the verdicts: objects name their `landmark`.
     ///
     /// # Errors
@@ -352,37 +407,42 @@ impl Cell {
     }
 
     fn send(&self, kind: ReportKind, frame: Frame) -> Result<bool, Error> {
-        let since_epoch = frame.captured_at.duration_since(SystemTime::UNIX_EPOCH);
-        let since_epoch = since_epoch
-            .map_err(|_| Error::Invalid("not sent: captured_at is before 1970".to_owned()))?;
+        let objects = frame.objects.len();
+        let captured_at = micros(frame.captured_at)?;
+        self.send_next(kind.topic(self.name.clone()), objects, |seq| {
+            let report = ObjectReport {
+                pose: frame.pose,
+                objects: frame.objects,
+                seen: frame.seen,
+                view: frame.view,
+                frame_yaw_rate_radps: frame.frame_yaw_rate_radps,
+                ..ObjectReport::new(self.name.clone(), seq, captured_at)
+            };
+            check(&report)?;
+            Ok(encode(&report, Encoding::Json))
+        })
+    }
+
+    /// Sends the report with the next number of the topic.
+    fn send_next(
+        &self,
+        topic: Topic,
+        objects: usize,
+        encoded: impl FnOnce(u64) -> Result<Vec<u8>, Error>,
+    ) -> Result<bool, Error> {
+        let path = self.topics.path(&topic);
         let Ok(mut sent) = self.sent.lock() else {
             return Ok(false);
         };
-        let Some(seq) = sent.get_mut(kind as usize) else {
-            return Ok(false);
-        };
-        let report = ObjectReport {
-            pose: frame.pose,
-            objects: frame.objects,
-            seen: frame.seen,
-            view: frame.view,
-            frame_yaw_rate_radps: frame.frame_yaw_rate_radps,
-            ..ObjectReport::new(
-                self.name.clone(),
-                *seq + 1,
-                Timestamp::default() + since_epoch,
-            )
-        };
-        check(&report)?;
-        let payload = encode(&report, Encoding::Json);
+        let seq = sent.entry(topic).or_default();
+        let payload = encoded(*seq + 1)?;
         let (bytes, at_most) = (payload.len(), Limits::default().payload_bytes);
         if bytes > at_most {
-            let objects = report.objects.len();
             return Err(Error::Invalid(format!(
                 "not sent: {bytes} bytes with {objects} objects, at most {at_most}"
             )));
         }
-        let is_sent = self.publish(&self.topics.path(&kind.topic(self.name.clone())), payload)?;
+        let is_sent = self.publish(&path, payload)?;
         *seq += 1;
         Ok(is_sent)
     }
@@ -478,24 +538,22 @@ pub fn now() -> Timestamp {
     Timestamp::default() + SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default()
 }
 
-/// Checks a report, and names the object that is not allowed.
+/// Checks a report, and names the field that is not allowed.
 fn check(report: &ObjectReport) -> Result<(), Error> {
     let limits = Limits::default();
-    let Err(reason) = report.validate(&limits) else {
-        return Ok(());
-    };
-    let is_at_fault = |object: &PerceivedObject| {
-        let alone = ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us);
-        ObjectReport {
-            objects: vec![object.clone()],
-            ..alone
-        }
-        .validate(&limits)
-        .is_err()
-    };
-    let place = report.objects.iter().position(is_at_fault);
-    let whose = place.map_or_else(String::new, |place| format!("objects[{place}]: "));
-    Err(Error::Invalid(format!("not sent: {whose}{reason}")))
+    report.validate(&limits).map_err(|reason| {
+        // JSON has no form for numbers that are not finite.
+        let flaw = Flaw::of_report(&encode(report, Encoding::Cbor), reason, &limits);
+        Error::Invalid(format!("not sent: {flaw}"))
+    })
+}
+
+/// The time as payloads state it.
+fn micros(captured_at: SystemTime) -> Result<Timestamp, Error> {
+    let since_epoch = captured_at
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .map_err(|_| Error::Invalid("not sent: captured_at is before 1970".to_owned()))?;
+    Ok(Timestamp::default() + since_epoch)
 }
 
 /// The parts of HOST:PORT; the port may be absent.

@@ -194,15 +194,16 @@ impl ConnectionState {
                     state.note_answer(answer.pkid, refused.map(|code| format!("{code:?}")));
                 }
                 Event::Incoming(Incoming::PubAck(answer)) => {
-                    let is_taken = matches!(
-                        answer.reason,
-                        PubAckReason::Success | PubAckReason::NoMatchingSubscribers
-                    );
                     let text = answer
                         .properties
                         .and_then(|properties| properties.reason_string);
-                    let refusal =
-                        (!is_taken).then(|| text.unwrap_or_else(|| format!("{:?}", answer.reason)));
+                    let refusal = match answer.reason {
+                        PubAckReason::Success => None,
+                        PubAckReason::NoMatchingSubscribers => state
+                            .asks_boxes(answer.pkid)
+                            .then(|| "only nodes place boxes, connect to a node".to_owned()),
+                        reason => Some(text.unwrap_or_else(|| format!("{reason:?}"))),
+                    };
                     state.note_answer(answer.pkid, refusal);
                 }
                 Event::Outgoing(Outgoing::Publish(packet) | Outgoing::Subscribe(packet))
@@ -335,6 +336,13 @@ impl State {
     fn ask(&mut self, topic: &str) {
         self.asked.insert(topic.to_owned());
         self.queued.push_back(topic.to_owned());
+    }
+
+    /// True if a packet asked whether the broker takes boxes.
+    fn asks_boxes(&self, packet: u16) -> bool {
+        self.unanswered
+            .get(&packet)
+            .is_some_and(|topic| topic.contains("/boxes/"))
     }
 
     fn note_answer(&mut self, packet: u16, refusal: Option<String>) {

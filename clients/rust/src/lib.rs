@@ -6,20 +6,18 @@ mod error;
 mod streams;
 mod tls;
 
-pub use cell::{Cell, Frame, Messages, Settings, now};
+pub use cell::{BoxFrame, Cell, Frame, Messages, Settings, now};
 pub use ecod;
+pub use ecod::model::geometry::Pose;
 pub use ecod::model::names::{Label, LandmarkId, NodeName};
 pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
 pub use ecod::model::time::Timestamp;
+pub use ecod::perception::camera::Mount;
 pub use ecod::wire::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState, NodeState,
-    NodeStatus, ObjectReport, PerceivedObject, Reputation, Reputations, Role, Trouble, Verdict,
-    Verdicts, WirePose,
+    BoxCamera, CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState,
+    NodeState, NodeStatus, ObjectReport, PerceivedObject, PixelBox, Reputation, Reputations, Role,
+    Trouble, Verdict, Verdicts, WirePose,
 };
 pub use error::Error;
 pub use streams::ForeignMessage;
 pub use tls::Tls;
-
-#[cfg(doctest)]
-#[doc = include_str!("../../../docs/programs.md")]
-struct Programs;

@@ -17,8 +17,8 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::pki::{Authority, TlsConfig};
 use ecod_client::{
-    Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, NodeName, NodeState,
-    PerceivedObject, Role, Settings, Timestamp, Tls,
+    BoxCamera, BoxFrame, Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, Mount,
+    NodeName, NodeState, PerceivedObject, PixelBox, Pose, Role, Settings, Timestamp, Tls, WirePose,
 };
 use ecod_testkit::{loopback, node_config, tls_files};
 use rumqttc::{Client, MqttOptions, QoS};
@@ -143,6 +143,62 @@ fn a_node_takes_reports_and_its_messages_are_read() {
             ("edge", Role::Edge, NodeState::Aggregating)
         );
         assert!(cell.counts().is_empty(), "{:?}", cell.counts());
+    }
+}
+
+/// A person of usual size, 5 m ahead of the camera of [`image`].
+fn person() -> PixelBox {
+    PixelBox {
+        label: "person".into(),
+        confidence: 0.9,
+        x_min: 450.0,
+        y_min: 320.0,
+        x_max: 550.0,
+        y_max: 660.0,
+    }
+}
+
+/// An image of a level camera, 1.3 m above the ground, that looks from the south at slot-0.
+fn image(boxes: Vec<PixelBox>) -> BoxFrame {
+    let mount = Mount {
+        height_m: Some(1.3),
+        pan_rad: std::f64::consts::FRAC_PI_2,
+        ..Mount::default()
+    };
+    let vehicle = Pose::from(WirePose::from_compass(0.0, -5.0, 90.0));
+    BoxFrame {
+        captured_at: SystemTime::now(),
+        boxes,
+        camera: BoxCamera {
+            width_px: 1000,
+            height_px: 1000,
+            fx: Some(1000.0),
+            fy: Some(1000.0),
+            cx: Some(500.0),
+            cy: Some(400.0),
+            tilt_sigma_rad: Some(0.005),
+            ..BoxCamera::default()
+        },
+        pose: mount.stated_pose(&mount.camera_pose(&vehicle)),
+        moving: None,
+    }
+}
+
+#[test]
+fn a_node_places_boxes_on_the_map() {
+    let node = Node::start(config("edge", Role::Edge));
+    let cell = Cell::connect(node.settings("euclid")).unwrap();
+    let began = Instant::now();
+    for map in cell.maps().timeout(SOON) {
+        let map = map.unwrap();
+        let place = &map.landmarks[0];
+        if place.label.as_deref() == Some("person") {
+            assert!(place.x_m.hypot(place.y_m) < 0.5, "{place:?}");
+            assert_eq!(place.contributors, [NodeName::from_static("euclid")]);
+            return;
+        }
+        cell.report_boxes(image(vec![person()])).unwrap();
+        assert!(began.elapsed() < SOON, "{map:?}");
     }
 }
 
@@ -513,7 +569,26 @@ fn what_no_cell_would_take_is_not_sent() {
     let frame = Frame::new(vec![good.clone(), wrong]);
     assert_eq!(
         said(cell.report(frame)),
-        "not sent: objects[1]: confidence_out_of_range"
+        "not sent: objects[1].confidence: is not within 0 to 1: 2.0"
+    );
+    let frame = Frame {
+        pose: Some(WirePose::new(1.0, 6.0, -90.0)),
+        ..Frame::new(vec![])
+    };
+    let text = said(cell.report(frame));
+    assert!(
+        text.starts_with("not sent: pose.heading_rad: is beyond 2π: -90.0")
+            && text.contains("degrees"),
+        "{text}"
+    );
+    let outside = PixelBox {
+        x_max: 1280.0,
+        ..person()
+    };
+    let text = said(cell.report_boxes(image(vec![outside])));
+    assert!(
+        text.starts_with("not sent: boxes[0]: is outside the image of 1000x1000"),
+        "{text}"
     );
     let frame = Frame {
         captured_at: SystemTime::UNIX_EPOCH - Duration::from_secs(1),
@@ -585,7 +660,6 @@ fn is_shown(page: &str, example: &str) -> bool {
 #[test]
 fn the_documented_programs_do_what_they_say() {
     for (page, name) in [
-        ("../../docs/programs.md", "maps_and_reports"),
         ("README.md", "maps_and_reports"),
         ("README.md", "report_frames"),
     ] {

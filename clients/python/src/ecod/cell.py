@@ -10,21 +10,22 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields
 from datetime import datetime
 from typing import Any, Optional, TypeVar, Union
 
-from .codec import Rejected, encode, is_list
+from .codec import Rejected, checked, encode, is_list
 from .connection import Connection, host_and_port, log, tls_context
 from .errors import Invalid, Silent
 from .geo import Origin
-from .messages import SCHEMA_VERSION, CellDescription, FieldOfView, GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Pose
-from .messages import Reputations, Verdicts, is_name
+from .messages import SCHEMA_VERSION, BoxReport, Camera, CellDescription, FieldOfView, GlobalMap, Mount, NodeStatus, ObjectReport
+from .messages import PerceivedObject, PixelBox, Pose, Reputations, Verdicts, is_name
 from .streams import Stream
 
 M = TypeVar("M")
 Objects = Iterable[Union[PerceivedObject, Mapping[str, Any]]]
+Boxes = Iterable[Union[PixelBox, Mapping[str, Any]]]
 AnyPose = Union[Pose, tuple[float, float, float]]
 Time = Union[datetime, float]
 
@@ -151,6 +152,40 @@ class Cell:
         """
         return self._report("detections", _listed("objects", objects), captured_at, pose, seen, view, frame_yaw_rate_radps)
 
+    def report_boxes(
+        self,
+        boxes: Boxes,
+        *,
+        camera: Camera,
+        pose: AnyPose,
+        mount: Optional[Mount] = None,
+        captured_at: Optional[Time] = None,
+        moving: Optional[bool] = None,
+    ) -> bool:
+        """Reports the boxes that a detector found in one image; the node at which the program is connected places them on the map.
+
+        The node projects them as it does the boxes of its own camera: by the foot of a box on the ground and by the usual
+        size of its label, with a covariance. `camera` is the image's size and optics. With a `mount`, `pose` is the
+        vehicle's; without one it is the camera's, perhaps with height, pitch and roll. `moving=False` is a camera that is
+        fixed at the road and no object of the map. An image without boxes is a report, too.
+
+        A box that gives no position, such as one above the horizon, is left out; the node counts it as `not_placed` and
+        states the reason on `nodes/<node>/clients`. The rest is as in `report`. Brokers other than those of nodes do not
+        place boxes: raises `Refused` where they answer that nobody receives them.
+        """
+        listed: list[PixelBox] = checked(list[PixelBox], _listed("boxes", boxes), "boxes")
+        for index, box in enumerate(listed):
+            flaw = box.flaw_in(camera)
+            if flaw:
+                raise Invalid(f"not sent: boxes[{index}]: {flaw}")
+        given: Pose = checked(Pose, _pose(pose), "pose")
+        place = given if mount is None else mount.camera_pose(given)
+
+        def report(seq: int) -> BoxReport:
+            return BoxReport(SCHEMA_VERSION, self.name, seq, micros(captured_at), place, camera, listed, moving)
+
+        return self._send("boxes", report, len(listed))
+
     def vote(
         self,
         objects: Objects,
@@ -226,11 +261,10 @@ class Cell:
         view: Optional[FieldOfView],
         frame_yaw_rate_radps: Optional[float] = None,
     ) -> bool:
-        full_topic = f"{self._root}{topic}/{self.name}"
         seen = None if seen is None else _listed("seen", seen)
-        with self._sending:
-            seq = self._seq[topic] + 1
-            report = ObjectReport(
+
+        def report(seq: int) -> ObjectReport:
+            return ObjectReport(
                 SCHEMA_VERSION,
                 self.name,
                 seq,
@@ -241,9 +275,17 @@ class Cell:
                 view,
                 frame_yaw_rate_radps=frame_yaw_rate_radps,
             )
-            payload = encode(report)
+
+        return self._send(topic, report, len(objects))
+
+    def _send(self, topic: str, report: Callable[[int], Any], entries: int) -> bool:
+        """Sends the report with the next number of the topic."""
+        full_topic = f"{self._root}{topic}/{self.name}"
+        with self._sending:
+            seq = self._seq[topic] + 1
+            payload = encode(report(seq))
             if len(payload) > MAX_REPORT_BYTES:
-                raise Invalid(f"not sent: {len(payload)} bytes with {len(objects)} objects, at most {MAX_REPORT_BYTES}")
+                raise Invalid(f"not sent: {len(payload)} bytes with {entries} objects, at most {MAX_REPORT_BYTES}")
             self._connection.raise_if_refused(full_topic)
             self._seq[topic] = seq
             is_sent = self._connection.publish(full_topic, payload)

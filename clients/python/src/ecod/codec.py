@@ -78,6 +78,17 @@ def encode(message: Any) -> bytes:
     return json.dumps(_plain(checked), allow_nan=False, separators=(",", ":")).encode()
 
 
+def checked(kind: Any, value: Any, place: str) -> Any:
+    """The value as this type of a field has it.
+
+    Raises `Invalid` with the place when the value is outside the protocol.
+    """
+    try:
+        return reader(kind)(value, False)
+    except Flaw as flaw:
+        raise Invalid(f"not sent: {place}{flaw.place}: {flaw.args[0]}") from None
+
+
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         named = ((field.name, getattr(value, field.name)) for field in fields(value))

@@ -40,6 +40,8 @@ MAX_WAITING = 16
 # client id, password, authorisation, banned, method.
 FINAL = frozenset({0x81, 0x82, 0x84, 0x85, 0x86, 0x87, 0x8A, 0x8C})
 
+# Reason code of MQTT 5 by which a broker states that nobody receives a message.
+NO_SUBSCRIBERS = 0x10
 
 # Remedy for a program without TLS.
 WITH_CERTIFICATES = " A cell with certificates has port 8883, and takes `ca`, `cert` and `key`"
@@ -222,8 +224,11 @@ class Connection:
             self.changed.notify_all()
 
     def _on_answer(self, mid: int, reason: Any, properties: Any) -> None:
-        if reason.is_failure:
+        is_unheard = reason.value == NO_SUBSCRIBERS and "/boxes/" in self._asked.get(mid, "")
+        if reason.is_failure or is_unheard:
             text = getattr(properties, "ReasonString", None) or f"{reason}; does the certificate or user allow it?"
+            if is_unheard:
+                text = "it is no broker of a node, and only nodes place boxes: connect to a node of the cell"
             log.warning("%s refuses %s: %s", self.at, self._asked.get(mid, "a request"), text)
             self._denied[mid] = text
             with self.changed:

@@ -1,4 +1,7 @@
-"""Objects of a report from what detectors give. Positions are metres in the cell's frame, one row for each detection."""
+"""Objects and boxes of reports from what detectors give.
+
+Positions are metres in the cell's frame, boxes pixels of the image, one row for each detection.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Any, Optional
 
 from .codec import is_list, number_of, numbers_of
 from .errors import Invalid
-from .messages import PerceivedObject
+from .messages import PerceivedObject, PixelBox
 
 
 def from_arrays(
@@ -57,6 +60,70 @@ def from_supervision(detections: Any, positions: Any, *, names: Optional[Mapping
 
     Labels are the detections' own class names, or those of `names` by class.
     """
+    return from_arrays(_labels_of(detections, names), detections.confidence, positions)
+
+
+def boxes_from_supervision(detections: Any, *, names: Optional[Mapping[int, str]] = None) -> list[PixelBox]:
+    """Boxes from `supervision.Detections`, for `Cell.report_boxes`.
+
+    Labels are the detections' own class names, or those of `names` by class.
+    """
+    labels = _labels_of(detections, names)
+    if not hasattr(detections, "xyxy"):
+        raise Invalid(f"{type(detections).__name__} has no xyxy: it must be supervision.Detections")
+    return _boxes(labels, detections.confidence, detections.xyxy)
+
+
+def boxes_from_ultralytics(result: Any) -> list[PixelBox]:
+    """Boxes from one of the results of an `ultralytics` model, or from its `summary()`, for `Cell.report_boxes`."""
+    if isinstance(result, list):
+        try:
+            edges = [[item["box"][name] for name in ("x1", "y1", "x2", "y2")] for item in result]
+            return _boxes([item["name"] for item in result], [item["confidence"] for item in result], edges)
+        except (LookupError, TypeError) as error:
+            raise Invalid(f"the list must be a summary() of ultralytics, or give one result instead of all: {error!r}") from None
+    found, names = getattr(result, "boxes", None), getattr(result, "names", None)
+    if found is None or names is None:
+        raise Invalid(f"{type(result).__name__} has no boxes with names: it must be one result of a detector of ultralytics")
+    classes, confidences, edges = (values.tolist() for values in (found.cls, found.conf, found.xyxy))
+    try:
+        labels = [names[int(number)] for number in classes]
+    except LookupError as error:
+        raise Invalid(f"`names` of the result must have a name for every class: {error!r}") from None
+    return _boxes(labels, confidences, edges)
+
+
+def boxes_from_coco(results: Iterable[Mapping[str, Any]], categories: Iterable[Mapping[str, Any]], image_id: Any = None) -> list[PixelBox]:
+    """Boxes of one image from results in COCO's JSON, for `Cell.report_boxes`.
+
+    `results` have `bbox` [x, y, width, height], `score`, `category_id` and `image_id`; `categories` are those of the
+    annotations, with `id` and `name`. Without an `image_id`, all results must be of one image.
+    """
+    try:
+        names = {category["id"]: category["name"] for category in categories}
+        chosen = [item for item in results if image_id is None or item["image_id"] == image_id]
+        images = {item.get("image_id") for item in chosen}
+        if len(images) > 1:
+            raise Invalid(f"the results are of {len(images)} images; give the `image_id` of one")
+        labels = [names[item["category_id"]] for item in chosen]
+        boxes = [numbers_of(item["bbox"], "x y width height", f"results[{row}].bbox") for row, item in enumerate(chosen)]
+        scores = [item["score"] for item in chosen]
+    except (LookupError, TypeError) as error:
+        raise Invalid(f"the results must be COCO's, with a category for each: {error!r}") from None
+    return _boxes(labels, scores, [[x, y, x + width, y + height] for x, y, width, height in boxes])
+
+
+def _boxes(labels: list[Any], confidences: Any, edges: Any) -> list[PixelBox]:
+    """Boxes from rows of labels, confidences and edges [left, top, right, bottom]."""
+    boxes = []
+    for row, label in enumerate(labels):
+        x_min, y_min, x_max, y_max = numbers_of(edges[row], "left top right bottom", f"boxes[{row}]")
+        boxes.append(PixelBox(str(label), number_of(confidences[row], f"confidences[{row}]"), x_min, y_min, x_max, y_max))
+    return boxes
+
+
+def _labels_of(detections: Any, names: Optional[Mapping[int, str]]) -> list[Any]:
+    """The label of each of `supervision.Detections`, which must have confidences."""
     missing = [name for name in ("confidence", "class_id", "data") if not hasattr(detections, name)]
     if missing:
         raise Invalid(f"{type(detections).__name__} has no {missing[0]}: it must be supervision.Detections")
@@ -70,7 +137,7 @@ def from_supervision(detections: Any, positions: Any, *, names: Optional[Mapping
             raise Invalid(f"`names` must have a name for every class of the detections: {error!r}") from None
     if labels is None:
         raise Invalid("the detections have no class names; give them as `names`, by class")
-    return from_arrays(list(labels), detections.confidence, positions)
+    return list(labels)
 
 
 def _rows(name: str, array: Any) -> int:

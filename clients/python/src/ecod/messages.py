@@ -8,10 +8,18 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import uuid
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from typing import Annotated, Any, Callable, Literal, NamedTuple, Optional
+
+from .errors import Invalid
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 SCHEMA_VERSION = 1
 
@@ -72,6 +80,13 @@ Size = Annotated[float, _between(0, 1e5)]
 Height = Annotated[float, _between(0, 1e5), MILLIMETRES]
 Speed = Annotated[float, _between(-1e4, 1e4)]
 Angle = Annotated[float, _between(-1e6, 1e6)]
+Heading = Annotated[
+    float,
+    Rule(
+        lambda value: abs(value) <= math.tau * (1 + 1e-6),
+        "must be from -2π to 2π: headings are in radians counter-clockwise from east, and `Pose.from_compass` takes degrees",
+    ),
+]
 YawRate = Annotated[float, _between(-100, 100)]
 Score = Annotated[float, _between(-1e9, 1e9)]
 Margin = Annotated[float, _between(0, 1e9)]
@@ -86,17 +101,57 @@ def time_of(micros: int) -> datetime:
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a camera (`WirePose` in the schema)."""
+    """Pose of a camera or a vehicle (`WirePose` in the schema). The heading is in radians, counter-clockwise from east."""
 
     x_m: Metres
     y_m: Metres
-    heading_rad: Angle
+    heading_rad: Heading
     height_m: Optional[Height] = None
     """Above the ground."""
     pitch_rad: Optional[Angle] = None
     """Below the horizon."""
     roll_rad: Optional[Angle] = None
     """Leaning to the right."""
+
+    @classmethod
+    def from_compass(cls, x_m: float, y_m: float, azimuth_deg: float) -> Pose:
+        """A pose from a heading in degrees clockwise from the map's north, which is its y axis.
+
+        It is true north unless the cell's `[origin]` rotates the map; `geo.Origin.pose` takes latitude and longitude.
+        Raises `Invalid` for an azimuth beyond ±360°.
+        """
+        if not abs(azimuth_deg) <= 360:
+            raise Invalid(f"azimuth_deg: {azimuth_deg!r} must be from -360 to 360, degrees clockwise from north")
+        return cls(x_m, y_m, math.remainder(math.radians(90 - azimuth_deg), math.tau))
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Mount of a camera on its vehicle, by the names of `camera.mount` in a node's configuration.
+
+    Metres ahead and to the left of the vehicle's reference point, and above the ground; degrees counter-clockwise from
+    the vehicle's heading (`pan_deg`), below the horizon (`pitch_deg`), and leaning to the camera's right (`roll_deg`).
+    Without a height objects are ranged by their size only.
+    """
+
+    height_m: Optional[float] = None
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    pan_deg: float = 0.0
+    forward_m: float = 0.0
+    left_m: float = 0.0
+
+    def camera_pose(self, vehicle: Pose) -> Pose:
+        """Pose of the camera for a pose of its vehicle."""
+        c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
+        return Pose(
+            vehicle.x_m + c * self.forward_m - s * self.left_m,
+            vehicle.y_m + s * self.forward_m + c * self.left_m,
+            math.remainder(vehicle.heading_rad + math.radians(self.pan_deg), math.tau),
+            self.height_m,
+            math.radians(self.pitch_deg),
+            math.radians(self.roll_deg),
+        )
 
 
 @dataclass(frozen=True)
@@ -139,6 +194,89 @@ class ObjectReport:
     clock_error_us: Optional[Count] = None
     # Of a frame that turns, counter-clockwise, as one that is fixed to a vehicle does.
     frame_yaw_rate_radps: Optional[YawRate] = None
+    moving: Optional[bool] = None
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Size, optics and accuracy of a camera (`BoxCamera` in the schema).
+
+    The names are those of `camera.optics`, calibration files and `camera.projection` of a node.
+
+    The optics are a field of view in degrees or, from a calibration, focal lengths and principal point in pixels, perhaps
+    with OpenCV's coefficients of distortion. `from_calibration` reads them from a file. The standard deviations have the
+    defaults of a node's camera, with 3 pixels for the edges of boxes.
+    """
+
+    width_px: int
+    height_px: int
+    horizontal_fov_deg: Optional[float] = None
+    vertical_fov_deg: Optional[float] = None
+    fx: Optional[float] = None
+    fy: Optional[float] = None
+    cx: Optional[float] = None
+    cy: Optional[float] = None
+    distortion: list[float] = field(default_factory=list)
+    pixel_sigma_px: Optional[float] = None
+    heading_sigma_rad: Optional[float] = None
+    tilt_sigma_rad: Optional[float] = None
+    height_sigma_m: Optional[float] = None
+    position_sigma_m: Optional[float] = None
+
+    def __post_init__(self) -> None:
+        calibrated = [self.fx, self.fy, self.cx, self.cy]
+        if self.horizontal_fov_deg is None and None in calibrated:
+            raise Invalid("camera: needs horizontal_fov_deg, or fx, fy, cx and cy of a calibration")
+        if self.horizontal_fov_deg is not None and (calibrated != [None] * 4 or self.distortion):
+            raise Invalid("camera: has horizontal_fov_deg and values of a calibration, and must have one of the two")
+
+    @classmethod
+    def from_calibration(cls, path: str) -> Camera:
+        """The camera of a file that `ecod-node calibrate` has written. Raises `Invalid` for another file."""
+        try:
+            with open(path, "rb") as file:
+                found = tomllib.load(file)
+            size = found["image_width"], found["image_height"]
+            return cls(*size, **{name: found[name] for name in ("fx", "fy", "cx", "cy", "distortion")})
+        except (tomllib.TOMLDecodeError, LookupError) as error:
+            raise Invalid(f"{path} is no calibration of `ecod-node calibrate`: {error!r}") from None
+
+
+@dataclass(frozen=True)
+class PixelBox:
+    """A box that a detector found: its label, confidence and edges in pixels, x to the right and y downwards."""
+
+    label: Label
+    confidence: Fraction
+    x_min: float
+    y_min: float
+    x_max: float
+    y_max: float
+
+    def flaw_in(self, camera: Camera) -> Optional[str]:
+        """Why the box cannot be of an image of this camera, if so. Detectors may exceed the image by 2 % of its size."""
+        edges = [self.x_min, self.y_min, self.x_max, self.y_max]
+        if not (self.x_min < self.x_max and self.y_min < self.y_max):
+            return f"has no area: {edges}"
+        width, height = camera.width_px, camera.height_px
+        is_inside = -0.02 * width <= self.x_min and self.x_max <= 1.02 * width and -0.02 * height <= self.y_min
+        if is_inside and self.y_max <= 1.02 * height:
+            return None
+        return f"is outside the image of {width}x{height} pixels: {edges}; `camera` must have the size of the image in which it was found"
+
+
+@dataclass(frozen=True)
+class BoxReport:
+    """The boxes of one image, which the node whose broker receives them places on the map."""
+
+    schema: Schema
+    node: Name
+    seq: Count
+    captured_at_us: Count
+    pose: Pose
+    camera: Camera
+    boxes: Annotated[list[PixelBox], _at_most(1024)]
+    # False of a camera that is fixed at the road.
     moving: Optional[bool] = None
 
 
