@@ -128,7 +128,7 @@ impl Door {
             TopicPlace::Door => door.may_say(principal, topic),
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
                 Some(Topic::Cell) => door.take_description(principal, &publish.payload),
-                Some(Topic::Nodes(name)) => door.take_dismissal(principal, &name),
+                Some(Topic::Nodes(name)) => door.take_dismissal(principal, name),
                 _ => door.take_report(principal, topic, &publish.payload),
             },
         }
@@ -355,7 +355,7 @@ impl DoorState {
     }
 
     /// Dismisses a missing node at the request of a program that may act as the node.
-    fn take_dismissal(&self, principal: &Principal, name: &NodeName) -> Result<(), DoorRefusal> {
+    fn take_dismissal(&self, principal: &Principal, name: NodeName) -> Result<(), DoorRefusal> {
         let DoorSetup { node, dismiss, .. } = &self.setup;
         if !principal.is_of(node) {
             let text = format!(
