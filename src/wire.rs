@@ -468,8 +468,8 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(11)]
     pub page: Option<String>,
-    /// Absent nodes that are not expected to return: the node itself after an orderly stop, and
-    /// nodes that an operator has dismissed at this node.
+    /// Nodes that are not missed when they are absent: the node itself after an orderly stop or if
+    /// it moves from cell to cell, and nodes that an operator has dismissed at this node.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(12), with = "skip_empty", has_nil)]
     pub dismissed: Vec<NodeName>,

@@ -18,7 +18,7 @@ use ecod::diagnostics::TroubleKind;
 use serde::Serialize;
 
 use crate::node::config::NodeConfig;
-use crate::node::running::{RunningNode, RunningReadiness, page_address};
+use crate::node::running::{RunningNode, RunningReadiness};
 
 /// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -107,17 +107,13 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 
 /// The node of this configuration, if it runs on this machine.
 async fn own_node(config: &NodeConfig) -> Option<Finding> {
-    let asked = config.clone();
-    let read = move || RunningNode::read(page_address(&asked), &asked);
-    let node = tokio::task::spawn_blocking(read).await.ok()?.ok()?;
-    node.is_of(config).then(|| {
-        let (name, RunningReadiness { ready, reason }) = (&node.node.name, &node.readiness);
-        let seen = format!("{name} runs: {reason}");
-        if *ready {
-            Finding::fine("node", seen)
-        } else {
-            Finding::doubtful("node", seen, "`ecod-node status` names its troubles")
-        }
+    let node = RunningNode::find(config).await?;
+    let (name, RunningReadiness { ready, reason }) = (&node.node.name, &node.readiness);
+    let seen = format!("{name} runs: {reason}");
+    Some(if *ready {
+        Finding::fine("node", seen)
+    } else {
+        Finding::doubtful("node", seen, "`ecod-node status` names its troubles")
     })
 }
 

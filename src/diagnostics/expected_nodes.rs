@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::wire::{MAX_DISMISSED, NodeStatus, Role};
+use crate::wire::{MAX_DISMISSED, NodeState, NodeStatus, Role};
 
 /// Maximum number of expected nodes; beyond it the longest absent one is dropped.
 const MAX_EXPECTED: usize = 256;
@@ -35,12 +35,15 @@ pub struct MissingNode {
 /// check on it is missing, until it answers again, or an operator dismisses it. A stop in order
 /// sends a status with `euclid` in its own list of dismissed nodes, so that it is not missing.
 ///
-/// Programs and observers beside a node have a name with a part and are not expected.
+/// Programs and observers beside a node have a name with a part and are not expected. Neither are
+/// visitors: vehicles that move from cell to cell, which dismiss themselves while they are present.
 #[derive(Debug, Clone, Default)]
 pub struct ExpectedNodes {
     nodes: BTreeMap<NodeName, ExpectedNode>,
     /// Nodes that have left or were dismissed, while they may still answer, and since when.
     departing: BTreeMap<NodeName, Timestamp>,
+    /// Present nodes that are not expected to stay.
+    visitors: BTreeSet<NodeName>,
     /// Nodes that were dismissed at this node and have not answered since.
     dismissed: BTreeSet<NodeName>,
     checked_at: Timestamp,
@@ -62,8 +65,9 @@ impl ExpectedNodes {
         let present: BTreeMap<_, _> = present.filter(|(name, _)| !name.is_part()).collect();
         self.departing
             .retain(|name, since| present.contains_key(name) && now.since(*since) < DEPARTURE);
+        self.visitors.retain(|name| present.contains_key(name));
         for (name, role) in present {
-            if !self.departing.contains_key(name) {
+            if !self.departing.contains_key(name) && !self.visitors.contains(name) {
                 self.dismissed.remove(name);
                 let node = ExpectedNode {
                     role,
@@ -81,9 +85,16 @@ impl ExpectedNodes {
         self.checked_at = now;
     }
 
-    /// Processes another node's status. A node dismisses itself when it leaves; others are
-    /// dismissed only by present nodes that may lead.
+    /// Processes another node's status. A node dismisses itself when it leaves, and a visitor
+    /// always; others are dismissed only by present nodes that may lead.
     pub fn receive(&mut self, status: &NodeStatus, now: Timestamp) {
+        if status.state != NodeState::Offline {
+            if status.dismissed.contains(&status.node) {
+                self.visitors.insert(status.node.clone());
+            } else {
+                self.visitors.remove(&status.node);
+            }
+        }
         for name in &status.dismissed {
             if *name == status.node || self.may_dismiss(&status.node) && !self.answers(name) {
                 self.depart(name, now);
@@ -170,6 +181,13 @@ mod tests {
         missing.map(|node| (node.name, node.last_seen)).collect()
     }
 
+    fn farewell(of: NodeName) -> NodeStatus {
+        NodeStatus {
+            state: NodeState::Offline,
+            ..dismissing(of.clone(), of)
+        }
+    }
+
     fn dismissing(by: NodeName, dismissed: NodeName) -> NodeStatus {
         NodeStatus {
             dismissed: vec![dismissed],
@@ -210,7 +228,7 @@ mod tests {
     fn a_node_that_leaves_in_order_is_not_missing_although_it_answers_a_moment_longer() {
         let mut expected = ExpectedNodes::default();
         check(&mut expected, &[(EUCLID, Role::Auto)], at(1));
-        expected.receive(&dismissing(EUCLID, EUCLID), at(1));
+        expected.receive(&farewell(EUCLID), at(1));
         check(&mut expected, &[(EUCLID, Role::Auto)], at(2));
         check(&mut expected, &[], at(3));
         assert_eq!(missing(&expected), []);
@@ -220,11 +238,28 @@ mod tests {
     fn a_node_that_returns_at_once_after_it_has_left_is_expected_again() {
         let mut expected = ExpectedNodes::default();
         check(&mut expected, &[(EUCLID, Role::Auto)], at(1));
-        expected.receive(&dismissing(EUCLID, EUCLID), at(1));
+        expected.receive(&farewell(EUCLID), at(1));
         check(&mut expected, &[(EUCLID, Role::Auto)], at(2));
         check(&mut expected, &[(EUCLID, Role::Auto)], at(12));
         check(&mut expected, &[], at(13));
         assert_eq!(missing(&expected), [(EUCLID, at(12))]);
+    }
+
+    #[test]
+    fn a_vehicle_that_passes_through_is_not_missing_when_it_is_gone() {
+        let mut expected = ExpectedNodes::default();
+        check(&mut expected, &[(EUCLID, Role::Cav)], at(1));
+        expected.receive(&dismissing(EUCLID, EUCLID), at(1));
+        check(&mut expected, &[(EUCLID, Role::Cav)], at(20));
+        check(&mut expected, &[], at(21));
+        assert_eq!(missing(&expected), []);
+        check(&mut expected, &[(EUCLID, Role::Cav)], at(30));
+        check(&mut expected, &[], at(31));
+        assert_eq!(
+            missing(&expected),
+            [(EUCLID, at(30))],
+            "it has another configuration now"
+        );
     }
 
     #[test]

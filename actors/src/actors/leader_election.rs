@@ -101,6 +101,8 @@ pub struct LeaderElectionArguments {
     pub counters: Arc<Counters>,
     /// The expected nodes of the cell.
     pub live_state: Arc<LiveState>,
+    /// True for a vehicle that moves from cell to cell and is not expected to stay.
+    pub is_visitor: bool,
 }
 
 /// Drives a [`LeadershipNode`](ecod::leadership::node::LeadershipNode).

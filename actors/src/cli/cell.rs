@@ -22,6 +22,7 @@ use uuid::Uuid;
 use super::{Failure, installation, print};
 use crate::node::config::{NodeConfig, SharedConfig};
 use crate::node::description::description_file;
+use crate::node::running::RunningNode;
 use crate::platform::bounded_file;
 use crate::transport::mqtt::MqttVersion;
 use crate::transport::mqtt::connection::{Client, Connection, MaxQos, Packet, Retention, open};
@@ -206,10 +207,17 @@ impl DoorClient {
             given.map(Path::to_owned)
         };
         let mut config = NodeConfig::load(file.as_deref(), &flags).map_err(Failure::usage)?;
+        // The node may have replaced a busy port.
+        let running = if file.is_some() && arguments.door.is_none() {
+            RunningNode::find(&config).await
+        } else {
+            None
+        };
+        let bound = running.and_then(|node| node.node.door);
         // Version 5 has reasons for refusals; the local broker requires no password.
         config.mqtt.version = MqttVersion::V5;
         (config.mqtt.user, config.mqtt.password) = (None, None);
-        let address = here(arguments.door.unwrap_or(config.broker_listen()));
+        let address = here(arguments.door.or(bound).unwrap_or(config.broker_listen()));
         let credentials = config.security().map_err(Failure::usage)?.credentials;
         let tls = credentials
             .as_ref()

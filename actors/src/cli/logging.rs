@@ -207,23 +207,27 @@ fn journal() -> std::io::Result<AnyLayer> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::{Arc, Mutex};
+    use std::io::{Read, Seek};
+    use std::sync::Arc;
 
     use super::*;
 
     #[test]
     fn the_counters_of_a_health_line_are_objects_in_json() {
-        let output = Arc::new(Mutex::new(Vec::new()));
-        let subscriber = tracing_subscriber::registry().with(json_to(Arc::clone(&output)));
+        let mut output = tempfile::tempfile().unwrap();
+        let written = Arc::new(output.try_clone().unwrap());
+        let subscriber = tracing_subscriber::registry().with(json_to(written));
         tracing::subscriber::with_default(subscriber, || {
             let counts = r#"{"published":3}"#;
             tracing::info!(target: health_log::TARGET, events = %counts, "health");
             tracing::info!(text = %counts, "other");
         });
-        let output = output.lock().unwrap();
-        let lines: Vec<Value> = serde_json::Deserializer::from_slice(&output)
-            .into_iter()
-            .map(Result::unwrap)
+        let mut text = String::new();
+        output.rewind().unwrap();
+        output.read_to_string(&mut text).unwrap();
+        let lines: Vec<Value> = text
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
             .collect();
         assert_eq!(
             (&lines[0]["message"], &lines[0]["events"]["published"]),

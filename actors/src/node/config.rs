@@ -518,7 +518,7 @@ mod tests {
             ),
             (
                 "role = \"edge\"\n[fusion.pace]\ngate = 1",
-                ["`fusion.pace.gate`", "unknown field", "`gate_m`"],
+                ["`fusion.pace.gate`", "unknown key", "`gate_m`"],
             ),
             (
                 "role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"",
@@ -576,7 +576,7 @@ mod tests {
             ),
             (
                 "kind = \"v4l2\"\nheight = 480\nwidht = 640",
-                ["`camera.source.widht`", "unknown field", "`width`"],
+                ["`camera.source.widht`", "unknown key", "`width`"],
             ),
             (
                 "kind = \"url\"\nurl = 7",

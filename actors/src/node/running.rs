@@ -39,6 +39,9 @@ pub struct RunningIdentity {
     pub role: Role,
     /// Version of its software.
     pub version: String,
+    /// Address at which its broker listens for programs; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub door: Option<SocketAddr>,
     /// End of its certificate's validity, in Unix microseconds; absent without a certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub certificate_ends_us: Option<Timestamp>,
@@ -104,6 +107,14 @@ impl RunningNode {
     /// Returns a [`PageError`] if no node answers there, or the node refuses the request.
     pub fn read(page: SocketAddr, config: &NodeConfig) -> Result<Self, PageError> {
         read_page(page, "/api/picture", config.dashboard.token.as_ref())
+    }
+
+    /// The node of a configuration, if it answers at its configured page.
+    pub async fn find(config: &NodeConfig) -> Option<Self> {
+        let asked = config.clone();
+        let read = move || Self::read(page_address(&asked), &asked).ok();
+        let node = tokio::task::spawn_blocking(read).await.ok()??;
+        node.is_of(config).then_some(node)
     }
 
     /// True if it is the node of this configuration.

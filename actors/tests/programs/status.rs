@@ -95,6 +95,13 @@ fn status_tells_scripts_whether_the_node_is_ready() {
         return;
     }
     let (directory, page) = machine("edge");
+    let file = directory.path().join("ecod/node.toml");
+    let toml = fs::read_to_string(&file).unwrap();
+    let listen = toml
+        .lines()
+        .find(|line| line.starts_with("listen"))
+        .unwrap();
+    fs::write(&file, toml.replacen(listen, "listen = \"127.0.0.1:0\"", 1)).unwrap();
     let absent = status(directory.path(), &[]);
     let said = text(&absent.stderr);
     assert_eq!(absent.status.code(), Some(6), "{said}");
@@ -115,6 +122,15 @@ fn status_tells_scripts_whether_the_node_is_ready() {
             && json["leadership"]["leader"] == "ada"
             && json["nodes"][0]["alive"] == true,
         "{json}"
+    );
+    let shown = ecod_node(directory.path())
+        .args(["cell", "show"])
+        .output()
+        .unwrap();
+    assert!(
+        text(&shown.stdout).contains("# cell daily: no description"),
+        "at the port that the node has taken: {}",
+        text(&shown.stderr)
     );
     let mut watching = ecod_node(directory.path());
     let watching = watching
@@ -211,7 +227,7 @@ fn a_log_begins_with_node_page_and_next_step_and_ends_without_a_warning() {
     for part in [
         "ada (edge) of cell daily runs, version ",
         &format!("page: http://{page}/"),
-        "next: `ecod-node status` shows the cell; another node joins by `ecod-node --name NAME --cell daily`",
+        "next: `ecod-node status` shows the cell; another node joins by `ecod-node --name NAME --cell daily --seed 127.0.0.1:",
     ] {
         let line = log
             .by_ref()

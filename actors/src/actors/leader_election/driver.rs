@@ -14,7 +14,7 @@ use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, NodeStatus, RejectReason, Role, Trouble};
+use ecod::wire::{Encoding, MAX_DISMISSED, NodeStatus, RejectReason, Role, Trouble};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -35,6 +35,7 @@ use crate::observe::recorder::LogItem;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::troubles::Troubles;
 use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
 use crate::transport::pki::Credentials;
 
@@ -52,6 +53,10 @@ pub struct ElectionDriver {
     counters: Arc<Counters>,
     life_signs: LifeSigns,
     live_state: Arc<LiveState>,
+    /// True for a vehicle that moves from cell to cell.
+    is_visitor: bool,
+    /// Nodes whose absence is a trouble.
+    missing: BTreeSet<NodeName>,
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
@@ -83,6 +88,7 @@ impl ElectionDriver {
             credentials,
             counters,
             live_state,
+            is_visitor,
         } = arguments;
         let saved_term = saved_term(term_file.as_ref());
         own_broker.mark_changed();
@@ -102,6 +108,8 @@ impl ElectionDriver {
             counters,
             life_signs: LifeSigns::new(cell, credentials),
             live_state,
+            is_visitor,
+            missing: BTreeSet::new(),
             overreached: BTreeSet::new(),
             name,
             complaint: None,
@@ -295,7 +303,11 @@ impl ElectionDriver {
                 self.live_state
                     .check_members(&self.members.borrow(), clock::now());
                 self.note_troubles();
-                let dismissed = self.live_state.expected().dismissed();
+                let mut dismissed = self.live_state.expected().dismissed();
+                if self.is_visitor {
+                    dismissed.truncate(MAX_DISMISSED - 1);
+                    dismissed.push(self.name.clone());
+                }
                 let looked = Input::Looked {
                     rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
@@ -354,7 +366,7 @@ impl ElectionDriver {
 
     /// Records troubles: wrong clocks, missing nodes, the leader's complaint, the end of the node's
     /// own certificate, and an unused description of the cell.
-    fn note_troubles(&self) {
+    fn note_troubles(&mut self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
         for clock in self.cell_time.wrong_clocks(clock::now()) {
             if clock.node.is_none() || leadership.is_leading() {
@@ -371,14 +383,9 @@ impl ElectionDriver {
             let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
             troubles.note_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
         }
-        let now = clock::now();
-        let missing = self.live_state.expected().missing().into_iter();
-        for MissingNode {
-            name, last_seen, ..
-        } in missing.filter(|node| now.since(node.last_seen) >= MISSING_TIMEOUT)
-        {
-            let cause = missing_words(now.since(last_seen), clock::wall());
-            troubles.note_about(name.as_str(), TroubleKind::NodeMissing, &cause);
+        let missing = note_missing(&self.live_state.expected().missing(), troubles);
+        for returned in self.missing.difference(&missing) {
+            troubles.settle(TroubleKind::NodeMissing, Some(returned.as_str()));
         }
         let complaint = self
             .complaint
@@ -399,6 +406,8 @@ impl ElectionDriver {
             Some(problem) => troubles.note(TroubleKind::Description, problem),
             None => troubles.settle(TroubleKind::Description, None),
         }
+        drop(leadership);
+        self.missing = missing;
     }
 
     /// Publishes the leadership; a change of only the highest term does not notify readers.
@@ -454,6 +463,21 @@ fn as_seen(member: &Member) -> node::SeenMember {
         broker: member.broker.map(BrokerAddress::from),
         is_on_this_machine: is_of_this_machine(member.gossip.ip()),
     }
+}
+
+/// Records the nodes that have been missing for long enough; returns their names.
+fn note_missing(nodes: &[MissingNode], troubles: &Troubles) -> BTreeSet<NodeName> {
+    let now = clock::now();
+    let missing = nodes
+        .iter()
+        .filter(|node| now.since(node.last_seen) >= MISSING_TIMEOUT);
+    missing
+        .map(|node| {
+            let cause = missing_words(now.since(node.last_seen), clock::wall());
+            troubles.note_about(node.name.as_str(), TroubleKind::NodeMissing, &cause);
+            node.name.clone()
+        })
+        .collect()
 }
 
 /// The absence of a node as text.

@@ -401,6 +401,7 @@ impl NodeBuilder {
             clock: self.clock.clone(),
             counters: self.counters(),
             live_state: self.live_state(),
+            is_visitor: self.moves_on(),
         }
     }
 
@@ -420,6 +421,7 @@ impl NodeBuilder {
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
+            door: *self.vehicle.listens_at.borrow(),
             guide: self.config.reporting(*self.vehicle.listens_at.borrow()),
             certificate_ends_us: None,
         };
@@ -531,7 +533,7 @@ impl NodeBuilder {
                 if !may_lead {
                     return Err("this node never leads and only follows: dismiss the node at one that may lead".into());
                 }
-                let is_dismissed = to_dismiss.dismiss(name, clock::now());
+                let is_dismissed = to_dismiss.dismiss(&name, clock::now());
                 is_dismissed.then_some(()).ok_or_else(|| {
                     format!("{name} answers, or this node has not seen it as a member; a node that answers leaves when it is stopped")
                 })

@@ -53,7 +53,7 @@ impl NodeBuilder {
                 Err(BrokerError::Bind { .. }) if attempts > 0 => {
                     tokio::time::sleep(REBIND_WAIT).await;
                 }
-                outcome => break outcome.map_err(unusable_address)?,
+                outcome => break outcome.map_err(|error| unusable_address(&error))?,
             }
         };
         self.vehicle.listens_at.send_replace(Some(bound));
@@ -142,8 +142,8 @@ impl NodeBuilder {
 }
 
 /// The error of a broker that cannot listen at the configured address, with the remedy.
-fn unusable_address(error: BrokerError) -> String {
-    let remedy = match &error {
+fn unusable_address(error: &BrokerError) -> String {
+    let remedy = match error {
         BrokerError::Bind { .. } => ": set another address, or stop the program that uses this one",
         _ => "",
     };

@@ -18,7 +18,13 @@ impl NodeConfig {
                 None if self.membership.has_key() => " and the same key".to_owned(),
                 None => " on this machine".to_owned(),
             };
-            return format!("another node joins by `ecod-node --name NAME --cell {cell}`{key}");
+            let seed = match self.membership.bind {
+                Some(bind) if !self.membership.multicast.enabled => format!(" --seed {bind}"),
+                _ => String::new(),
+            };
+            return format!(
+                "another node joins by `ecod-node --name NAME --cell {cell}{seed}`{key}"
+            );
         };
         let directory = tls.ca.parent().unwrap_or(Path::new("."));
         if !directory.join("pki").exists() {

@@ -1,5 +1,6 @@
 //! Inputs of the dashboard. Reading them does not block other parts of the node.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::model::names::{Label, LandmarkId, NodeName};
@@ -76,6 +77,9 @@ pub struct NodeFacts {
     pub started_at_us: Timestamp,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
+    /// Address at which its broker listens for programs; absent without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub door: Option<SocketAddr>,
     /// How vehicles begin to report, for a cell without reports.
     pub guide: String,
     /// End of the validity of its certificate; absent without one.

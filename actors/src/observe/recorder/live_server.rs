@@ -72,7 +72,7 @@ impl LiveServer {
             Err(error) => {
                 if is_first {
                     let port = self.port;
-                    tracing::warn!(port, %error, "cannot serve the log live; trying again every {RETRY_AFTER:?}");
+                    tracing::warn!(port, %error, "cannot serve the log live; trying again every {} s", RETRY_AFTER.as_secs());
                 }
                 State::Down {
                     retry_at: Some(Instant::now() + RETRY_AFTER),

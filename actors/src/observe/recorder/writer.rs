@@ -237,7 +237,7 @@ impl LogWriter {
                 McapError::Io(disk) => disk.to_string(),
                 other => other.to_string(),
             };
-            tracing::warn!(%directory, error, "not recording, the node goes on; trying again every {RETRY_AFTER:?}");
+            tracing::warn!(%directory, error, "not recording, the node goes on; trying again every {} s", RETRY_AFTER.as_secs());
         }
     }
 }

@@ -73,7 +73,7 @@ pub struct DoorSetup {
     /// Sets the cell's description, given as TOML, or returns the reason for refusing it.
     pub describe: Arc<dyn Fn(String) -> Result<(), String> + Send + Sync>,
     /// Dismisses a missing node for the whole cell, or returns the reason for refusing it.
-    pub dismiss: Arc<dyn Fn(&NodeName) -> Result<(), String> + Send + Sync>,
+    pub dismiss: Arc<dyn Fn(NodeName) -> Result<(), String> + Send + Sync>,
     /// Starts or stops receiving the reports of all vehicles.
     pub watch_reports: Arc<dyn Fn(bool) + Send + Sync>,
     /// The node's counters.

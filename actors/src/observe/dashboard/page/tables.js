@@ -40,7 +40,7 @@ export function latency(samples) {
   const middle = last.map((sample) => sample.latency_p50_ms).sort((a, b) => a - b)[last.length >> 1];
   const most = Math.max(...last.map((sample) => sample.latency_max_ms));
   text(byId("latency"), last.length ? milliseconds(middle) : "–");
-  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "no map in 10 s");
+  text(byId("latency-more"), last.length ? `median of 10 s, at most ${milliseconds(most)}` : "no map with reports in 10 s");
 }
 
 export function places(scene) {

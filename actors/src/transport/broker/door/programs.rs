@@ -142,7 +142,7 @@ impl Door {
             TopicPlace::Door => door.may_say(principal, topic),
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
                 Some(Topic::Cell) => door.take_description(principal, &publish.payload),
-                Some(Topic::Nodes(name)) => door.take_dismissal(principal, &name),
+                Some(Topic::Nodes(name)) => door.take_dismissal(principal, name),
                 Some(Topic::Boxes(name)) => {
                     let route = door.route(principal, &name)?;
                     self.take_boxes(&name, route, &publish.payload)
@@ -470,7 +470,7 @@ impl DoorState {
     }
 
     /// Dismisses a missing node at the request of a program that may act as the node.
-    fn take_dismissal(&self, principal: &Principal, name: &NodeName) -> Result<(), DoorRefusal> {
+    fn take_dismissal(&self, principal: &Principal, name: NodeName) -> Result<(), DoorRefusal> {
         let DoorSetup { node, dismiss, .. } = &self.setup;
         if !principal.is_of(node) {
             let text = format!(
