@@ -202,6 +202,21 @@ mod tests {
     }
 
     #[test]
+    fn a_cameras_heading_is_accepted_by_receivers_whatever_the_vehicles_and_the_pan() {
+        let pan_rad = std::f64::consts::PI;
+        let mount = Mount {
+            pan_rad,
+            ..Mount::default()
+        };
+        for heading_rad in [-6.2, 0.5, 6.2, 700.0] {
+            let camera = mount.camera_pose(&Pose::new(0.0, 0.0, heading_rad));
+            assert!(camera.heading_rad.abs() <= HEADING_BOUND_RAD);
+            let off_rad = wrap_angle(camera.heading_rad - heading_rad - pan_rad);
+            assert!(off_rad.abs() < 1e-9, "{heading_rad}");
+        }
+    }
+
+    #[test]
     fn a_pitched_camera_looks_down_and_a_rolled_one_leans_to_its_right() {
         let axis = Vector3::z();
         let pitched = Mount {
