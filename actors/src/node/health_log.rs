@@ -12,15 +12,15 @@ use crate::transport::gossip::FrameCounters;
 pub(crate) const TARGET: &str = "ecod_actors::node::health";
 
 /// Counts of one group by label.
-type Counts = BTreeMap<String, u64>;
+type LoggedCounts = BTreeMap<String, u64>;
 
 /// Counts at the time of the last line.
 #[derive(Debug, Default)]
 pub(super) struct HealthLog {
-    events: Counts,
-    rejects: Counts,
-    shed: Counts,
-    frames: Counts,
+    events: LoggedCounts,
+    rejects: LoggedCounts,
+    shed: LoggedCounts,
+    frames: LoggedCounts,
 }
 
 impl HealthLog {
@@ -55,11 +55,11 @@ fn named(counts: BTreeMap<&'static str, u64>) -> impl Iterator<Item = (String, u
 
 /// The counts that differ from the logged ones, as a JSON object; `None` if all are equal.
 fn changed(
-    logged: &mut Counts,
+    logged: &mut LoggedCounts,
     counts: impl Iterator<Item = (String, u64)>,
 ) -> Option<DisplayValue<String>> {
     let is_new = |(label, times): &(String, u64)| logged.get(label).unwrap_or(&0) != times;
-    let news: Counts = counts.filter(is_new).collect();
+    let news: LoggedCounts = counts.filter(is_new).collect();
     let text = (!news.is_empty()).then(|| display(json!(news).to_string()));
     logged.extend(news);
     text
@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn a_count_is_logged_when_it_has_changed() {
-        let mut logged = Counts::default();
+        let mut logged = LoggedCounts::default();
         let mut line = |sent, lost| {
             let counts = [("sent".to_owned(), sent), ("lost".to_owned(), lost)];
             changed(&mut logged, counts.into_iter()).map(|text| text.to_string())
