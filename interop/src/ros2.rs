@@ -97,6 +97,7 @@ mod tests {
 
     use ecod::model::epoch::Epoch;
     use ecod::model::geometry::Covariance;
+    use ecod::model::names::is_label;
     use ecod::model::time::Timestamp;
     use ecod::wire::{FusedObject, LandmarkState, Limits, PerceivedObject, WirePose};
     use proptest::collection::vec;
@@ -197,7 +198,7 @@ mod tests {
             velocity_mps in option::of([up_to(1e4), up_to(1e4)]),
             heading_rad in option::of(up_to(1e6)),
             size_m in option::of([up_to(102_400.0).prop_map(f64::abs), up_to(102_400.0).prop_map(f64::abs)]),
-            label in prop_oneof![Just("car".to_owned()), "\\PC{1,16}"],
+            label in prop_oneof![Just("car".to_owned()), "\\PC{1,16}".prop_filter("a label", |text| is_label(text))],
             score in 0.0..=1.0,
         ) -> PerceivedObject {
             PerceivedObject {

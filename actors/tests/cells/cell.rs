@@ -241,7 +241,7 @@ async fn a_part_that_keeps_ending_makes_the_node_give_up() {
         }
     }
     let error = timeout(PATIENCE, edge.failed()).await.unwrap().unwrap_err();
-    assert!(error.to_string().contains("Fuser"), "{error}");
+    assert!(error.to_string().contains("fuser: "), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
