@@ -474,3 +474,5 @@ class NodeStatus:
     description: Optional[DescriptionStatus]
     troubles: list[Trouble] = field(default_factory=list)
     page: Optional[Label] = None
+    # Nodes that are not missed when they are absent: itself after an orderly stop, and those that an operator dismissed.
+    dismissed: Annotated[list[Name], _at_most(16)] = field(default_factory=list)
