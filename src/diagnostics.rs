@@ -111,7 +111,7 @@ trouble_kinds! {
     CertificateEnds = "certificate_ends", UNTIL_SETTLED, "create a new one by `ecod-node pki issue`, and copy its two files here: no restart";
     /// A second running node of a name.
     NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
-    /// A former member that does not answer, and has neither left in order nor been dismissed.
+    /// A former member does not answer, without an orderly stop and without a dismissal by an operator.
     NodeMissing = "node_missing", SHORT, "start it again; if it does not come back, `ecod-node cell dismiss` with its name ends this";
     /// An unanswered seed at a node that has discovered no other member.
     SeedSilent = "seed_silent", LONG, "start it, give both nodes the same `cell` and key, or let UDP through; without such a node, remove it from `membership.seeds`";

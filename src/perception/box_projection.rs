@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::camera::{Intrinsics, Mount};
-use super::distortion::{Distortion, undistort};
+use super::distortion::{self, undistort};
 use super::landmark::{LandmarkGate, LandmarkIndex};
 use super::projection::{NEURAL_PIXEL_SIGMA_PX, ObjectSizes, Projection, ProjectionConfig};
 use super::view::{PosedCamera, ViewConfig, landmarks_in_view};
@@ -50,7 +50,8 @@ impl BoxProjector {
             roll_rad: pose.roll_rad.unwrap_or(0.0),
             ..Mount::default()
         };
-        let (intrinsics, distortion) = (intrinsics_of(camera), distortion_of(camera));
+        let intrinsics = intrinsics_of(camera);
+        let distortion = distortion::from_first(&camera.distortion);
         let projection = Projection::new(self.config_of(camera), intrinsics, mount);
         let camera_pose = (*pose).into();
         let (mut objects, mut unplaced) = (Vec::new(), Vec::new());
@@ -131,15 +132,6 @@ fn intrinsics_of(camera: &BoxCamera) -> Intrinsics {
         }
         None => Intrinsics::with_square_pixels(width, height, horizontal_rad),
     }
-}
-
-fn distortion_of(camera: &BoxCamera) -> Option<Distortion> {
-    let mut coefficients = Distortion::default();
-    coefficients
-        .iter_mut()
-        .zip(&camera.distortion)
-        .for_each(|(to, from)| *to = *from);
-    (!camera.distortion.is_empty()).then_some(coefficients)
 }
 
 #[cfg(test)]

@@ -8,6 +8,16 @@ use crate::model::detection::{BoundingBox, Detection};
 /// OpenCV's k1, k2, p1, p2, k3, k4, k5, k6; the last three are 0 unless the model is rational.
 pub type Distortion = [f64; 8];
 
+/// The coefficients of a lens from the first ones, in OpenCV's order; `None` if all are 0, as those of
+/// a lens without distortion.
+pub fn from_first(stated: &[f64]) -> Option<Distortion> {
+    let mut distortion = Distortion::default();
+    for (coefficient, stated) in distortion.iter_mut().zip(stated) {
+        *coefficient = *stated;
+    }
+    distortion.iter().any(|k| *k != 0.0).then_some(distortion)
+}
+
 /// Maximum number of steps of the iteration. The distortion of common lenses needs at most 20.
 const MAX_STEPS: usize = 100;
 

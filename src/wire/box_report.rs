@@ -272,13 +272,12 @@ impl PixelBox {
         let flaw = |field: &str, reason, fault: String| {
             Flaw::new(reason, format!("boxes[{index}]{field}"), fault)
         };
-        let Self {
+        let bounds @ BoundingBox {
             x_min,
             y_min,
             x_max,
             y_max,
-            ..
-        } = *self;
+        } = self.bounding_box();
         for (field, edge) in [
             (".x_min", x_min),
             (".y_min", y_min),
@@ -290,7 +289,7 @@ impl PixelBox {
                 return Err(flaw(field, RejectReason::NotFinite, fault));
             }
         }
-        if !self.bounding_box().is_valid() {
+        if !bounds.is_valid() {
             let fault = format!("has no area: [{x_min}, {y_min}, {x_max}, {y_max}]");
             return Err(flaw("", RejectReason::OutOfRange, fault));
         }

@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
-use ecod::perception::distortion::Distortion;
+use ecod::perception::distortion;
 use opencv::core::{
     Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector,
 };
@@ -224,13 +224,8 @@ impl Calibration {
             cy,
             ..
         } = *self;
-        let mut distortion = Distortion::default();
-        for (coefficient, stated) in distortion.iter_mut().zip(&self.distortion) {
-            *coefficient = *stated;
-        }
-        let distorts = distortion.iter().any(|k| *k != 0.0);
         Lens {
-            distortion: distorts.then_some(distortion),
+            distortion: distortion::from_first(&self.distortion),
             ..Lens::ideal(Intrinsics {
                 width,
                 height,

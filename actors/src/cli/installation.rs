@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::Failure;
 use crate::node::config::NodeConfig;
+use crate::node::config::guidance::SERVICE_DIRECTORY;
 
 /// Flag that names the configuration of a node of this machine.
 #[derive(Debug, Args)]
@@ -33,9 +34,6 @@ impl ConfigurationArguments {
         Ok((config, file))
     }
 }
-
-/// Directory from which the service reads its configuration.
-pub(super) const SERVICE_DIRECTORY: &str = "/etc/ecod";
 
 /// Directory of a node that a user has made without the rights of root.
 const USER_DIRECTORY: &str = "ecod";

@@ -7,7 +7,7 @@
 mod cameras;
 mod cells;
 mod extraction;
-mod guidance;
+pub(crate) mod guidance;
 mod observer;
 mod printed;
 mod shared;

@@ -353,7 +353,7 @@ async fn a_camera_that_has_turned_is_named_with_its_angle() {
     node.stop().await;
 }
 
-/// An observer counts neither as a node nor, after it was killed, as a missing one.
+/// Counts of nodes leave out an observer, also as a missing node after it was killed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_observer_is_no_node() {
     let (edge, page) = start(config("edge", Role::Edge, 1)).await;

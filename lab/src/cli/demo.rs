@@ -31,7 +31,7 @@ const RECORDED: &str = include_str!("../../../examples/testbed/pace_setup1.json"
 /// Name of the street among the scenes.
 const STREET: &str = "street";
 
-/// What a newcomer has to know before the first line of a scene.
+/// Explains the demo's words: node, report, leader, map.
 const INTRODUCTION: &str = "\
 A cell on this machine, each node a process of its own: an edge, and nodes with a camera. Each node detects
 objects and reports them. One node, the leader, fuses all reports into one map and sends it to every node.

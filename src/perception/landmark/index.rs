@@ -146,8 +146,8 @@ impl LandmarkIndex {
         )
     }
 
-    /// The object with the landmark that [`Self::best`] finds for it. An object without a covariance
-    /// belongs to none.
+    /// The object with the landmark that [`Self::best`] finds for it; an object without a covariance
+    /// stays without a landmark.
     #[must_use]
     pub fn assigned(&self, object: PerceivedObject, gate: &LandmarkGate) -> PerceivedObject {
         let point = Point2::new(object.x_m, object.y_m);

@@ -10,8 +10,9 @@ use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
 
-use crate::cli::installation::{self, SERVICE_DIRECTORY};
+use crate::cli::installation;
 use crate::node::config::END_OF_CONFIGURATION;
+use crate::node::config::guidance::SERVICE_DIRECTORY;
 use crate::platform::bounded_file;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use super::NodeConfig;
 
-/// Directory of the node of a machine, which needs no flag.
-const SERVICE_DIRECTORY: &str = "/etc/ecod";
+/// Directory of the configuration of a machine's service; commands read it without a flag.
+pub(crate) const SERVICE_DIRECTORY: &str = "/etc/ecod";
 
 impl NodeConfig {
     /// How another node joins the cell of this one.

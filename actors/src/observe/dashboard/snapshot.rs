@@ -102,8 +102,8 @@ pub(crate) struct NodeEntry {
     /// Address and port of its page, where this node's users may reach it. Its own page is left
     /// out.
     pub page: Option<SocketAddr>,
-    /// True if the node does not answer although it is expected: it was a member, and has neither
-    /// left in order nor been dismissed.
+    /// True if the node does not answer although it is expected: a former member that ended
+    /// without an orderly stop and that no operator has dismissed.
     pub missing: bool,
     /// Time at which a missing node last answered this node.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -175,7 +175,7 @@ fn object(
     }
     let object = ParsedObject {
         entry: place,
-        // −1 says that a box has no identity.
+        // A `track_id` of −1 marks a box without an identity.
         id: track_id.filter(|id| *id >= 0),
         label,
         score,

@@ -185,9 +185,11 @@ impl Door {
             let refusal = DoorRefusal::new(RefusalReason::Rejected(RejectReason::NotPlaced), text);
             self.note_refusal(name.as_str(), &setup.topics.path(&topic), &refusal);
         }
-        let votes = report.votes();
-        if (setup.fuses)(ReportKind::VoteDetections) && !votes.objects.is_empty() {
-            door.pass_on(ReportKind::VoteDetections, votes, route);
+        if (setup.fuses)(ReportKind::VoteDetections) {
+            let votes = report.votes();
+            if !votes.objects.is_empty() {
+                door.pass_on(ReportKind::VoteDetections, votes, route);
+            }
         }
         if (setup.fuses)(ReportKind::Detections) {
             door.pass_on(ReportKind::Detections, report, route);
@@ -577,7 +579,7 @@ impl Handler for DoorHooks {
                 };
                 let place = self.door.place_of(&principal, publish);
                 moved.topic = place.topic(&publish.topic).into();
-                // rmqtt asks for the right to publish a message, but not for that of a last will.
+                // rmqtt calls `Permissions` for a published message, but not for a last will.
                 if let FromType::LastWill = from.typ()
                     && let Err(refusal) =
                         self.door.take(&principal, (place, &publish.topic), publish)
