@@ -110,10 +110,16 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 # All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
 # Most tests wait most of their time. TEST_FLAGS=--no-run only builds them.
+# nextest (.config/nextest.toml) takes little more than half of the time, because it runs tests of several programs at once.
 test: export RUST_TEST_THREADS ?= $(shell expr 2 '*' $$(nproc))
 test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
 test: setup ## [check] all tests
+ifeq ($(shell cargo nextest --version >/dev/null 2>&1 && echo nextest),nextest)
+	cargo nextest run --locked --test-threads $$((3 * $$(nproc))) $(TEST_FLAGS)
+	cargo test --locked --doc $(TEST_FLAGS)
+else
 	cargo test --locked $(TEST_FLAGS)
+endif
 
 test-dashboard: PACKAGES += chromium chromium-driver
 test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium

@@ -264,7 +264,7 @@ fn a_pipeline_gives_frames() {
 
 #[test]
 fn a_pipeline_with_a_missing_element_names_it_and_no_secret() {
-    let pipeline = "nosuchsrc location=rtsp://user:secret@camera/1 ! appsink";
+    let pipeline = "nosuchsrc location=rtsp://user:hunter2@camera/1 ! appsink";
     let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'"))
         .err()
         .expect("missing")
@@ -273,14 +273,14 @@ fn a_pipeline_with_a_missing_element_names_it_and_no_secret() {
         error.starts_with("cannot open nosuchsrc location=rtsp://camera/1"),
         "{error}"
     );
-    assert!(!error.contains("secret"), "{error}");
+    assert!(!error.contains("hunter2"), "{error}");
 }
 
 /// A network camera on a free port that answers whoever asks as `answer` does; its address.
 fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!(
-        "http://user:secret@{}/stream",
+        "http://user:hunter2@{}/stream",
         listener.local_addr().unwrap()
     );
     std::thread::spawn(move || {
@@ -339,7 +339,7 @@ fn a_network_camera_gives_frames_until_it_hangs_up() {
         panic!("a live source does not end: {end}")
     };
     assert!(
-        origin.ends_with("/stream") && !origin.contains("secret"),
+        origin.ends_with("/stream") && !origin.contains("hunter2"),
         "{origin}"
     );
 }
@@ -359,7 +359,7 @@ fn a_network_camera_that_says_nothing_is_given_up_in_time() {
         "it has a limit of its own"
     );
     assert!(
-        error.starts_with("cannot open http://127.0.0.1") && !error.contains("secret"),
+        error.starts_with("cannot open http://127.0.0.1") && !error.contains("hunter2"),
         "{error}"
     );
 }
@@ -534,13 +534,16 @@ fn secrets_of_an_address_are_on_no_command_line_and_in_no_log() {
     );
     for file in ["cmdline", "environ"] {
         let text = fs::read(format!("/proc/{}/{file}", node.program)).unwrap();
-        assert!(!String::from_utf8_lossy(&text).contains("secret"), "{file}");
+        assert!(
+            !String::from_utf8_lossy(&text).contains("hunter2"),
+            "{file}"
+        );
     }
     until("the camera is lost", || {
         log(directory.path()).contains("frame source failed")
     });
     assert!(
-        !log(directory.path()).contains("secret"),
+        !log(directory.path()).contains("hunter2"),
         "{}",
         log(directory.path())
     );
