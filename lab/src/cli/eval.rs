@@ -1,5 +1,6 @@
-//! `ecod-lab eval`: accuracy of the output of a replay.
+//! `ecod-lab eval`: accuracy of the output of a replay, or of several methods beside each other.
 
+mod comparison;
 mod tracks;
 
 use std::collections::BTreeSet;
@@ -11,17 +12,18 @@ use clap::Args;
 use ecod::model::names::Label;
 use ecod::perception::landmark::LandmarkIndex;
 use ecod::replay::{FusedLine, ReplayConfig, read_report};
-use ecod::wire::{GlobalMap, RejectReason};
+use ecod::wire::{GlobalMap, RejectReason, Verdicts};
 use ecod_actors::cli::lines::{self, LineRead, read_line};
 use ecod_actors::cli::{Failure, cell};
 use ecod_actors::platform::bounded_file;
 use serde::Deserialize;
+use serde_json::Value;
 
 use super::columns::columns;
 use super::files::frame_rate;
 use super::write_json;
 use crate::eval::formats::FileFormat;
-use crate::eval::tracks::TrackTruth;
+use crate::eval::tracks::{TrackScores, TrackTruth};
 use crate::eval::{ClassRecall, EvalResult, Evaluation, Scores, Truth};
 use crate::report::tracks::percent;
 
@@ -33,9 +35,10 @@ pub(super) struct EvalArguments {
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
     /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a
-    /// file of that form
-    #[arg(long, value_name = "FILE")]
-    input: PathBuf,
+    /// file of that form. Several are compared in one table, in a row for each NAME; files of one
+    /// NAME are runs of one method, with other seeds for example
+    #[arg(long = "input", value_name = "[NAME=]FILE", required = true)]
+    inputs: Vec<MethodFile>,
     /// The reports that were replayed, for majority vote and every vehicle alone
     #[arg(long, value_name = "FILE")]
     reports: Option<PathBuf>,
@@ -49,9 +52,49 @@ pub(super) struct EvalArguments {
     /// Frames a second in files of --format
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = frame_rate, requires = "format")]
     frame_rate: f64,
-    /// Write the results to this file (JSON)
+    /// Write the results to this file (JSON); of several inputs also as CSV or LaTeX, if the file
+    /// ends in .csv or .tex
     #[arg(short, long = "output", alias = "out", value_name = "FILE")]
     out: Option<PathBuf>,
+}
+
+/// A file to evaluate, and the name of the method that made it.
+#[derive(Debug, Clone)]
+struct MethodFile {
+    method: Option<String>,
+    path: PathBuf,
+}
+
+impl From<&str> for MethodFile {
+    /// Reads `NAME=FILE` or `FILE`; a file whose path has a `=` is a file if it exists.
+    fn from(text: &str) -> Self {
+        match text.split_once('=') {
+            Some((method, path)) if !method.is_empty() && !Path::new(text).exists() => Self {
+                method: Some(method.to_owned()),
+                path: path.into(),
+            },
+            _ => Self {
+                method: None,
+                path: text.into(),
+            },
+        }
+    }
+}
+
+impl MethodFile {
+    /// The given name of the method, or the file's name.
+    fn method(&self) -> String {
+        let of_file = || self.path.file_stem().unwrap_or(self.path.as_os_str());
+        self.method
+            .clone()
+            .unwrap_or_else(|| of_file().to_string_lossy().into_owned())
+    }
+}
+
+/// The result of one file.
+enum Evaluated {
+    Locations(Box<EvalResult>),
+    Tracks(Box<TrackScores>),
 }
 
 /// Longest line of output in bytes: the last of several passes is one line.
@@ -71,16 +114,13 @@ enum InputLine {
 pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     let path = &arguments.truth;
     if let Some(out) = &arguments.out {
-        let reports = arguments.reports.iter();
-        let mut inputs: Vec<_> = [path, &arguments.input]
-            .into_iter()
-            .chain(reports)
-            .cloned()
-            .collect();
-        for directory in [path, &arguments.input]
-            .into_iter()
-            .filter(|input| input.is_dir())
-        {
+        let judged = || {
+            [path]
+                .into_iter()
+                .chain(arguments.inputs.iter().map(|input| &input.path))
+        };
+        let mut inputs: Vec<_> = judged().chain(&arguments.reports).cloned().collect();
+        for directory in judged().filter(|input| input.is_dir()) {
             let files = arguments
                 .format
                 .map(|format| format.files(directory))
@@ -90,14 +130,41 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
         }
         lines::check_apart(out, &inputs).map_err(Failure::usage)?;
     }
+    if let [MethodFile { method: None, path }] = &arguments.inputs[..] {
+        return print_one(arguments, &evaluate(arguments, path)?);
+    }
+    let mut runs = Vec::new();
+    for input in &arguments.inputs {
+        runs.extend(comparison::runs(input, &evaluate(arguments, &input.path)?));
+    }
+    comparison::print(&runs, arguments.out.as_deref())
+}
+
+/// Prints the tables of one file, and writes its result.
+fn print_one(arguments: &EvalArguments, evaluated: &Evaluated) -> Result<(), Failure> {
+    match evaluated {
+        Evaluated::Locations(result) => {
+            print!("{}", table(result));
+            if let Some(out) = &arguments.out {
+                write_json(out, result)?;
+            }
+        }
+        Evaluated::Tracks(scores) => tracks::print_scores(scores, arguments.out.as_deref())?,
+    }
+    Ok(())
+}
+
+/// Evaluates one file by the truth.
+fn evaluate(arguments: &EvalArguments, input: &Path) -> Result<Evaluated, Failure> {
+    let path = &arguments.truth;
     if let Some(format) = arguments.format {
-        return tracks::run_files(arguments, format);
+        return tracks::evaluate_files(arguments, format, input);
     }
     let text =
         bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()));
     let text = text.map_err(Failure::usage)?;
     if TrackTruth::is_in(&text) {
-        return tracks::run(arguments, &text);
+        return tracks::evaluate(arguments, &text, input);
     }
     let config = cell(arguments.config.as_deref())?;
     let truth = Truth::parse(&text).with_context(|| format!("truth {}", path.display()));
@@ -110,23 +177,18 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
             gate,
         );
     }
-    read_output(&arguments.input, |line| evaluation.fused(&line))?;
+    read_output(input, |line| evaluation.fused(&line))?;
     if !evaluation.meets_truth() {
         eprintln!(
             "no location of {} is in {} at the time of a line; locations count by their exact ids",
-            arguments.input.display(),
+            input.display(),
             path.display()
         );
     }
     if let Some(reports) = &arguments.reports {
         read_reports(&mut evaluation, reports, &config)?;
     }
-    let result = evaluation.result();
-    print!("{}", table(&result));
-    if let Some(out) = &arguments.out {
-        write_json(out, &result)?;
-    }
-    Ok(())
+    Ok(Evaluated::Locations(Box::new(evaluation.result())))
 }
 
 fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failure> {
@@ -136,7 +198,7 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
         let line = match line.map(serde_json::from_slice) {
             Some(Ok(InputLine::Fused(line))) => line,
             Some(Ok(InputLine::Received { map })) => FusedLine::Map(map),
-            _ => return unreadable.add(number, "it is neither a map nor verdicts"),
+            _ => return unreadable.add(number, fault_of(line)),
         };
         if let FusedLine::Map(GlobalMap { objects, .. }) = &line
             && let Some((place, reason)) = objects
@@ -162,6 +224,28 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
     } else {
         Ok(())
     }
+}
+
+/// Why a line is neither a map nor verdicts; `None` stands for a line that is too long.
+fn fault_of(line: Option<&[u8]>) -> String {
+    let Some(line) = line else {
+        return format!("it is longer than {MAX_LINE_BYTES} bytes");
+    };
+    let value: Value = match serde_json::from_slice(line) {
+        Ok(value) => value,
+        Err(error) => return format!("it is not JSON: {error}"),
+    };
+    // The map log of a node has the map beside its time of receipt.
+    let map = value.get("map").unwrap_or(&value);
+    let fault = if value.get("verdicts").is_some() {
+        serde_path_to_error::deserialize::<_, Verdicts>(&value).err()
+    } else {
+        serde_path_to_error::deserialize::<_, GlobalMap>(map).err()
+    };
+    fault.map_or_else(
+        || "it is neither a map nor verdicts".to_owned(),
+        |error| format!("it is neither a map nor verdicts: {error}"),
+    )
 }
 
 fn read_reports(

@@ -526,3 +526,69 @@ fn what_cannot_be_judged_is_said() {
         assert!(said_by(&run).contains(part), "{truth:?}: {}", said_by(&run));
     }
 }
+
+/// A method of one's own beside ECOD, by the template in the manual.
+#[test]
+fn methods_are_compared_in_one_table() {
+    let folder = TempDir::new().unwrap();
+    let (own, table) = (folder.path().join("own.jsonl"), folder.path().join("table"));
+    let fusion = Command::new("python3")
+        .arg(example("own_fusion.py"))
+        .stdin(fs::File::open(example("recordings/lot.jsonl")).unwrap())
+        .stdout(fs::File::create(&own).unwrap())
+        .status()
+        .unwrap();
+    assert!(fusion.success());
+    let ecod = replay_lot(&folder);
+    let inputs = [
+        format!("--input=ecod={}", text(&ecod)),
+        format!("--input=own={}", text(&own)),
+        format!("--input=own={}", text(&own)),
+    ];
+    for (ending, part) in [
+        ("csv", "method,file,accuracy %"),
+        ("tex", "own, PACE & 2 & "),
+        ("json", "\"method\": \"ecod, VOTE\""),
+    ] {
+        let file = table.with_extension(ending);
+        let run = ecod_lab(&[
+            "eval",
+            "--truth",
+            text(&example("recordings/lot_truth.json")),
+            &inputs[0],
+            &inputs[1],
+            &inputs[2],
+            "--output",
+            text(&file),
+        ]);
+        succeeded(&run);
+        let printed = String::from_utf8(run.stdout).unwrap();
+        let row = |method: &str| printed.lines().find(|line| line.starts_with(method));
+        assert!(row("ecod, PACE").unwrap().contains("100.00"), "{printed}");
+        assert!(row("own, PACE").unwrap().contains(" ± 0.00"), "{printed}");
+        let written = fs::read_to_string(&file).unwrap();
+        assert!(written.contains(part), "{written}");
+    }
+}
+
+#[test]
+fn what_a_line_of_output_lacks_is_named() {
+    let folder = TempDir::new().unwrap();
+    let input = folder.path().join("own.jsonl");
+    let map = r#"{"schema":1,"aggregator":"own","epoch":1,"round":1,"fused_at_us":1,"landmarks":[],
+        "objects":[{"id":"67e55044-10b1-426f-9247-bb680e5fe0c8","label":"car","confidence":1}]}"#;
+    fs::write(&input, map.replace('\n', "")).unwrap();
+    let run = ecod_lab(&[
+        "eval",
+        "--truth",
+        text(&example("recordings/lot_truth.json")),
+        "--input",
+        text(&input),
+    ]);
+    assert!(!run.status.success());
+    let error = said_by(&run);
+    assert!(
+        error.contains("verdicts: objects[0]: missing field `x_m`"),
+        "{error}"
+    );
+}

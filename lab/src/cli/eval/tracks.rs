@@ -10,7 +10,7 @@ use ecod::replay::FusedLine;
 use ecod_actors::cli::{Failure, lines};
 use serde::Serialize;
 
-use super::{EvalArguments, columns, read_output, write_json};
+use super::{EvalArguments, Evaluated, columns, read_output, write_json};
 use crate::cli::files;
 use crate::eval::formats::{FileContext, FileFormat, check_lengths, sequence_at, time_of};
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
@@ -18,23 +18,31 @@ use crate::report::tracks::{tables, without_map};
 
 /// Contents of the file of `--output`.
 #[derive(Serialize)]
-struct Judged {
-    tracks: TrackScores,
+struct Judged<'a> {
+    tracks: &'a TrackScores,
 }
 
-pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> {
+/// Evaluates maps by a truth of places.
+pub(super) fn evaluate(
+    arguments: &EvalArguments,
+    text: &str,
+    input: &Path,
+) -> Result<Evaluated, Failure> {
     let path = &arguments.truth;
     let truth = TrackTruth::parse(text)
         .with_context(|| format!("truth {}", path.display()))
         .map_err(Failure::usage)?;
-    judge_maps(arguments, TrackEvaluation::new(truth), None)
+    judge_maps(arguments, input, TrackEvaluation::new(truth), None)
 }
 
 /// Evaluates maps, or files in a benchmark's form, by the truth in files of that benchmark.
-pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
+pub(super) fn evaluate_files(
+    arguments: &EvalArguments,
+    format: FileFormat,
+    input: &Path,
+) -> Result<Evaluated, Failure> {
     let EvalArguments {
         truth: path,
-        input,
         frame_rate,
         config,
         ..
@@ -84,10 +92,10 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
         .map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);
     match said {
-        None => judge_maps(arguments, evaluation, Some(sequences)),
+        None => judge_maps(arguments, input, evaluation, Some(sequences)),
         Some(said) => {
             evaluation.sequences(&said, *frame_rate);
-            print_scores(arguments, evaluation)
+            result(arguments, input, evaluation)
         }
     }
 }
@@ -111,31 +119,38 @@ fn is_of_maps(input: &Path) -> Result<bool, Failure> {
 /// numbers of sequences must be equal.
 fn judge_maps(
     arguments: &EvalArguments,
+    input: &Path,
     mut evaluation: TrackEvaluation,
     sequences: Option<RangeInclusive<usize>>,
-) -> Result<(), Failure> {
+) -> Result<Evaluated, Failure> {
     let mut mapped = BTreeSet::new();
-    read_output(&arguments.input, |line| {
+    read_output(input, |line| {
         if let FusedLine::Map(map) = line {
             evaluation.map(&map);
             mapped.insert(sequence_at(map.fused_at_us));
         }
     })?;
-    let (truth, input) = (arguments.truth.display(), arguments.input.display());
+    let truth = arguments.truth.display();
     if mapped.is_empty() {
-        return Err(anyhow!("there is no map in {input}").into());
+        return Err(anyhow!("there is no map in {}", input.display()).into());
     }
     if let Some(sequences) = sequences.filter(|sequences| !sequences.contains(&mapped.len())) {
         let (sequences, mapped) = (sequences.end(), mapped.len());
         let what = format!(
-            "{truth} has {sequences} sequences, and {input} maps of {mapped}: give truth of just these"
+            "{truth} has {sequences} sequences, and {} maps of {mapped}: give truth of just these",
+            input.display()
         );
         return Err(Failure::usage(anyhow!(what)));
     }
-    print_scores(arguments, evaluation)
+    result(arguments, input, evaluation)
 }
 
-fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Result<(), Failure> {
+/// The figures, with warnings about input that can hardly be meant.
+fn result(
+    arguments: &EvalArguments,
+    input: &Path,
+    evaluation: TrackEvaluation,
+) -> Result<Evaluated, Failure> {
     if arguments.reports.is_some() || (arguments.config.is_some() && arguments.format.is_none()) {
         return Err(Failure::usage(anyhow!(
             "--reports and --config are for a truth of locations"
@@ -144,7 +159,7 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
     if let Some((said, truth)) = evaluation.labels_that_never_meet() {
         eprintln!(
             "no object of {} has a class of {}: {said} there, {truth} in the truth; classes count by their exact names",
-            arguments.input.display(),
+            input.display(),
             arguments.truth.display()
         );
     }
@@ -152,7 +167,7 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
     if scores.frames_with_map == 0 {
         let what = format!(
             "no map of {} is at the time of any frame of {}",
-            arguments.input.display(),
+            input.display(),
             arguments.truth.display()
         );
         return Err(anyhow!(what).into());
@@ -160,15 +175,20 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
     if let Some(warning) = without_map(&scores) {
         eprintln!("{warning}");
     }
+    Ok(Evaluated::Tracks(Box::new(scores)))
+}
+
+/// Prints the tables of one file, and writes its figures.
+pub(super) fn print_scores(scores: &TrackScores, out: Option<&Path>) -> Result<(), Failure> {
     print!(
         "{}",
-        tables(&scores)
+        tables(scores)
             .iter()
             .map(|rows| columns(rows))
             .collect::<Vec<_>>()
             .join("\n")
     );
-    if let Some(out) = &arguments.out {
+    if let Some(out) = out {
         write_json(out, &Judged { tracks: scores })?;
     }
     Ok(())
