@@ -6,6 +6,7 @@ mod intersection;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
@@ -94,7 +95,9 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     if let Some(out) = &arguments.out {
         check_writable(out)?;
     }
-    let mut results = Vec::with_capacity(scenes.len());
+    let total = scenes.len();
+    let mut results: Vec<SceneResult> = Vec::with_capacity(total);
+    let start = Instant::now();
     for scene in scenes {
         let trial = Trial {
             testbed: &testbed,
@@ -112,6 +115,16 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
         }
         results.push(trial.run(&reports));
         bar.finish_and_clear();
+        if let Some(result) = results.last().filter(|_| total > 1) {
+            let left = start.elapsed() / results.len() as u32 * (total - results.len()) as u32;
+            eprintln!(
+                "{}: {:.2} % right; {} of {total} scenes done, about {} s left",
+                result.name,
+                result.pace_accuracy_pct,
+                results.len(),
+                left.as_secs()
+            );
+        }
         // After each scene: finished results are kept, even if a later scene fails.
         if let Some(out) = &arguments.out {
             write_json(out, &Results { scenes: &results })?;

@@ -87,6 +87,8 @@ pub struct SceneResult {
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,
+    /// Right spots in percent by PACE in `paper` mode; null if it does not run.
+    pub paper_accuracy_pct: Option<f64>,
     /// Right spots in percent by VOTE alone; null if VOTE does not run.
     pub vote_accuracy_pct: Option<f64>,
     /// Right spots in percent as PACE and VOTE agree on them; null if one of them does not run.
@@ -145,6 +147,7 @@ impl SceneResult {
             name: scene.name.clone(),
             verdicts,
             pace_accuracy_pct: fused.accuracy_pct(),
+            paper_accuracy_pct: None,
             vote_accuracy_pct: None,
             answer_accuracy_pct: None,
             occupied_accuracy_pct: fused.occupied_accuracy_pct(),

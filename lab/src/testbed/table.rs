@@ -11,6 +11,7 @@ pub fn table(results: &[SceneResult]) -> String {
         "scene",
         "maps",
         "right %",
+        "`paper` mode %",
         "occupied spots %",
         "best vehicle alone %",
         "all said empty %",
@@ -68,7 +69,7 @@ pub fn table(results: &[SceneResult]) -> String {
     text
 }
 
-const COLUMNS: usize = 8;
+const COLUMNS: usize = 9;
 
 fn row(result: &SceneResult) -> [String; COLUMNS] {
     let percent = |pct: Option<f64>| pct.map_or_else(|| "-".into(), |pct| format!("{pct:.2}"));
@@ -82,6 +83,7 @@ fn row(result: &SceneResult) -> [String; COLUMNS] {
         result.name.clone(),
         result.verdicts.to_string(),
         percent(Some(result.pace_accuracy_pct)),
+        percent(result.paper_accuracy_pct),
         percent(result.occupied_accuracy_pct),
         percent(best_alone),
         percent(Some(result.always_empty_pct)),

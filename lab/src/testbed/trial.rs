@@ -10,6 +10,7 @@ use anyhow::Context;
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::pace::PaceMode;
 use ecod::wire::{ObjectReport, RejectReason, ReportKind};
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
@@ -40,6 +41,7 @@ impl Trial<'_> {
     /// Fuses the reports of the scene's vehicles and evaluates the maps.
     pub fn run(&self, reports: &BTreeMap<NodeName, Vec<ObjectReport>>) -> SceneResult {
         let mut fused = self.aggregator(Algorithms::Pace);
+        let mut by_paper = self.paper_aggregator();
         let (mut voting, mut agreeing) = (
             self.aggregator(Algorithms::Vote),
             self.aggregator(Algorithms::Both),
@@ -51,7 +53,7 @@ impl Trial<'_> {
             .iter()
             .map(|cav| (cav.name.clone(), alone()))
             .collect();
-        let [mut score, mut votes, mut answers] = [SpotScore::default(); 3];
+        let [mut score, mut paper, mut votes, mut answers] = [SpotScore::default(); 4];
         for verdict in 0..self.verdicts {
             let steps =
                 verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
@@ -60,6 +62,7 @@ impl Trial<'_> {
             let all: Vec<_> = reports.values().flat_map(|cav| of_verdict(cav)).collect();
             for (aggregator, score) in [
                 (&mut fused, &mut score),
+                (&mut by_paper, &mut paper),
                 (&mut voting, &mut votes),
                 (&mut agreeing, &mut answers),
             ] {
@@ -79,6 +82,7 @@ impl Trial<'_> {
         let [vote_accuracy_pct, answer_accuracy_pct] =
             [votes, answers].map(|score| Some(score.accuracy_pct()));
         SceneResult {
+            paper_accuracy_pct: Some(paper.accuracy_pct()),
             vote_accuracy_pct,
             answer_accuracy_pct,
             ..result
@@ -172,11 +176,21 @@ impl Trial<'_> {
     }
 
     fn aggregator(&self, algorithms: Algorithms) -> Aggregator {
-        let landmarks = self.scene.landmarks(&self.testbed.placard);
-        let fusion = FusionConfig {
+        self.aggregator_with(FusionConfig {
             algorithms,
             ..setup::fusion(self.testbed)
-        };
+        })
+    }
+
+    /// PACE with the formulas of the paper.
+    fn paper_aggregator(&self) -> Aggregator {
+        let mut fusion = setup::fusion(self.testbed);
+        fusion.pace.mode = PaceMode::Paper;
+        self.aggregator_with(fusion)
+    }
+
+    fn aggregator_with(&self, fusion: FusionConfig) -> Aggregator {
+        let landmarks = self.scene.landmarks(&self.testbed.placard);
         Aggregator::new(NodeName::from_static("edge"), 1, fusion, landmarks, START)
     }
 }
