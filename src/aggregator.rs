@@ -17,7 +17,6 @@ mod answer;
 mod command;
 mod config;
 mod expelled;
-mod foreign_view;
 mod map_share;
 mod neighbouring;
 mod report_doubt;
@@ -33,7 +32,6 @@ pub use config::{Algorithms, FusionConfig};
 pub use report_doubt::ReportDoubt;
 
 use expelled::Expelled;
-use foreign_view::ForeignView;
 use map_share::limit_shares;
 use nalgebra::Point2;
 use neighbouring::NeighbourView;
@@ -106,9 +104,7 @@ pub struct Aggregator {
     placements: Placements,
     expelled: Expelled,
     neighbours: NeighbourView,
-    foreign: ForeignView,
     /// Weight of the initial score in published reputations, in votes.
-    initial_votes: f64,
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty
@@ -129,7 +125,7 @@ impl Aggregator {
             vote,
             reputation,
         } = config;
-        let (by_packets, initial_votes) = (vote.mode == VoteMode::Paper, reputation.initial_votes);
+        let by_packets = vote.mode == VoteMode::Paper;
         let vote = algorithms
             .vote()
             .then(|| Vote::new(vote, landmarks.clone()));
@@ -152,8 +148,6 @@ impl Aggregator {
             placements: Placements::default(),
             expelled: Expelled::default(),
             neighbours: NeighbourView::default(),
-            foreign: ForeignView::default(),
-            initial_votes,
             vote,
             by_packets,
             voted: false,
@@ -192,9 +186,7 @@ impl Aggregator {
             .iter_mut()
             .for_each(|known| known.configure(window.clone()));
         self.rounds.configure(round);
-        (self.by_packets, self.initial_votes) =
-            (vote.mode == VoteMode::Paper, reputation.initial_votes);
-        self.foreign.repeat();
+        self.by_packets = vote.mode == VoteMode::Paper;
         self.vote = algorithms.vote().then(|| match self.vote.take() {
             Some(known) => known.configured(vote, landmarks.clone()),
             None => Vote::new(vote, landmarks.clone()),
@@ -546,7 +538,6 @@ impl Aggregator {
     }
 
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
-        self.foreign.weigh(self.vote.as_mut(), self.tracks.as_mut());
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let tracks = self
             .tracks

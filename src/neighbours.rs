@@ -12,13 +12,11 @@
 //!   [`CellMapFilter`] determines their age.
 //! - Objects are converted to this cell's frame through their place on Earth.
 //!
-//! [`ReputationExchange`] handles the counts about vehicles that cells exchange.
 
 mod area;
 mod extent;
 mod filter;
 mod frame;
-mod reputation_exchange;
 #[cfg(test)]
 mod tests;
 
@@ -29,7 +27,6 @@ use nalgebra::Point2;
 
 pub use area::CoveredArea;
 pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
-pub use reputation_exchange::{ExchangeStep, ReputationExchange};
 
 use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;

@@ -8,11 +8,7 @@
 //! Marks allow old votes to be dropped: a mark holds a vehicle's counts at an earlier number of
 //! votes. It is written once. The latest mark alone decides which marks are kept, so that merging
 //! them is a join too.
-//!
-//! Counts of other cells ([`ForeignReputations`]) are not part of the ledger: they change a
-//! vehicle's initial score.
 
-mod foreign;
 mod ledger;
 mod marks;
 mod record;
@@ -24,13 +20,12 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-pub use foreign::{CellCounts, ForeignReputations, MAX_FOREIGN_VEHICLES};
 pub use ledger::ReputationLedger;
 pub use replication::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
 use crate::config::config_section;
 use crate::model::names::{Label, NodeName};
-use crate::wire::{ForeignVotes, MAX_INTEGER};
+use crate::wire::MAX_INTEGER;
 
 /// A settled vote: it is final whether the vote agreed with the verdict.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,11 +55,6 @@ impl Counts {
         self.correct.saturating_add(self.incorrect)
     }
 
-    /// Share of votes that agreed, after adding one vote of each kind.
-    pub(crate) fn share(self) -> f64 {
-        (self.correct as f64 + 1.0) / (self.total() as f64 + 2.0)
-    }
-
     /// Counts one vote.
     pub(crate) fn add(&mut self, correct: bool) {
         let count = if correct {
@@ -79,13 +69,6 @@ impl Counts {
         Self {
             correct: sum(self.correct, other.correct),
             incorrect: sum(self.incorrect, other.incorrect),
-        }
-    }
-
-    fn minus(self, other: Self) -> Self {
-        Self {
-            correct: self.correct.saturating_sub(other.correct),
-            incorrect: self.incorrect.saturating_sub(other.incorrect),
         }
     }
 
@@ -119,13 +102,8 @@ impl ReputationConfig {
     /// (Jøsang & Ismail 2002). Unlike there, the prior is not uniform but [`Self::initial`] with
     /// the weight [`Self::initial_votes`].
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
-        self.mean_with(correct, incorrect, ForeignVotes::default())
-    }
-
-    /// As [`Self::mean`], for a vehicle about which other cells have counts.
-    pub fn mean_with(&self, correct: f64, incorrect: f64, foreign: ForeignVotes) -> f64 {
-        let prior = self.initial * self.initial_votes + foreign.correct;
-        (correct + prior) / (correct + incorrect + self.initial_votes + foreign.total())
+        let prior = self.initial * self.initial_votes;
+        (correct + prior) / (correct + incorrect + self.initial_votes)
     }
 }
 

@@ -48,8 +48,7 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::wire::{
-    ForeignVotes, LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation,
-    Verdict,
+    LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict,
 };
 use configured_method::ConfiguredMethod;
 use method::NewVote;
@@ -521,12 +520,6 @@ impl Vote {
     /// mode.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.method.get_mut().adopt(ledger, &self.config);
-    }
-
-    /// Sets the votes of other cells, given the weight of the prior in votes; has no effect in
-    /// `paper` mode.
-    pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
-        self.method.get_mut().set_foreign(&votes_beside);
     }
 
     /// Continues from published reputations, after a restart or a change of aggregator; has no

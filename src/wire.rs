@@ -15,8 +15,7 @@
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
-//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`],
-//! [`ReputationTopic`]).
+//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`]).
 //!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU
 //! frame.
@@ -25,7 +24,6 @@
 
 mod box_report;
 mod cell_map;
-mod cell_reputation;
 mod client_refusals;
 pub(crate) mod codec;
 mod compact;
@@ -36,7 +34,6 @@ mod numbers;
 mod object;
 mod region_topic;
 mod reject;
-mod reputation_topic;
 mod topic;
 mod trouble;
 mod validation;
@@ -51,7 +48,6 @@ use uuid::Uuid;
 
 pub use box_report::{BoxCamera, BoxReport, PixelBox, decode_boxes, encode_boxes};
 pub use cell_map::{CellMap, NeighbourObject};
-pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_entries, decode_report, decode_share, encode};
 pub use description::{
@@ -63,7 +59,6 @@ pub use numbers::use_integers;
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;
-pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
@@ -415,10 +410,6 @@ pub struct Reputation {
     /// Number of votes that disagreed with the verdict.
     #[n(2)]
     pub incorrect: u64,
-    /// Counts of other cells, as far as they are included in the score; absent without such counts.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[n(3)]
-    pub foreign: Option<ForeignVotes>,
 }
 
 /// A node's status, published by itself; the broker publishes the last will when the node goes
@@ -549,7 +540,6 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
         ("BoxReport", schemars::schema_for!(BoxReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("CellMap", schemars::schema_for!(CellMap)),
-        ("CellReputation", schemars::schema_for!(CellReputation)),
         ("Verdicts", schemars::schema_for!(Verdicts)),
         ("CellDescription", schemars::schema_for!(CellDescription)),
         ("Reputations", schemars::schema_for!(Reputations)),

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
-use ecod::wire::{RegionTopic, RegionTopicKind, ReputationTopic};
+use ecod::wire::{RegionTopic, RegionTopicKind};
 
 /// The account of a cell. All nodes of the cell that may lead share it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,21 +30,16 @@ impl CellAccount {
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let (tile, cell) = (*tile, cell.clone());
-        let own = RegionTopicKind::ALL.map(|kind| {
-            RegionTopic {
-                tile,
-                cell: cell.clone(),
-                kind,
-            }
-            .path()
+        let own = RegionTopicKind::ALL.map(|kind| RegionTopic {
+            tile,
+            cell: cell.clone(),
+            kind,
         });
-        own.into_iter()
-            .chain([ReputationTopic::filter_of_cell(&cell)])
-            .collect()
+        own.iter().map(RegionTopic::path).collect()
     }
 
-    /// MQTT filters of the topics that the cell may read: its own topics, maps and descriptions of
-    /// the tiles around, and reputations.
+    /// MQTT filters of the topics that the cell may read: its own topics, and maps and descriptions
+    /// of the tiles around.
     ///
     /// Statuses of other cells are excluded: they contain the runs of nodes, from which the ids of
     /// their connections could be derived.
@@ -53,11 +48,10 @@ impl CellAccount {
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
         let around = tile.with_neighbours().into_iter();
         let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
-        let own = [
-            RegionTopic::filter_of_cell(*tile, cell),
-            ReputationTopic::filter_everywhere(),
-        ];
-        own.into_iter().chain(around).collect()
+        [RegionTopic::filter_of_cell(*tile, cell)]
+            .into_iter()
+            .chain(around)
+            .collect()
     }
 
     /// The user as an element of `users` in NATS's configuration.
@@ -117,18 +111,15 @@ mod tests {
         let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
         let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
         let below = ["map", "cell", "status"].map(|kind| format!("{own}/lot-1/{kind}"));
-        assert_eq!(
-            account.writes(),
-            [&below[..], &["ecod/v1/rep/+/lot-1".to_owned()]].concat()
-        );
+        assert_eq!(account.writes(), below);
         assert_eq!(
             account.reads().len(),
-            20,
-            "its own, the reputations, two kinds of nine tiles"
+            19,
+            "its own, two kinds of nine tiles"
         );
         let nats = account.nats("secret");
         assert!(
-            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.status\", \"ecod.v1.rep.*.lot-1\""),
+            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.status\"]"),
             "{nats}"
         );
         assert!(

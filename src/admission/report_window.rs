@@ -204,15 +204,6 @@ impl ReportWindow {
         }
     }
 
-    /// The vehicles that were active recently, once for each part.
-    pub(crate) fn present(&self, now: Timestamp) -> impl Iterator<Item = NodeName> {
-        let present = self
-            .vehicles
-            .iter()
-            .filter(move |(_, vehicle)| now.since(vehicle.last_received) < RETENTION);
-        present.map(|(name, _)| name.vehicle())
-    }
-
     /// Makes room for a vehicle or a part of one, if there is any.
     fn make_room(&mut self, name: &NodeName, now: Timestamp) -> Result<(), RejectReason> {
         let is_full = |vehicles: &BTreeMap<NodeName, VehicleClock>| {

@@ -13,7 +13,7 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
-use crate::reputation::{ForeignReputations, ReputationLedger};
+use crate::reputation::ReputationLedger;
 use crate::wire::{GlobalMap, NeighbourObject, Reputation};
 
 /// A call of an aggregator's method of the same name.
@@ -55,12 +55,6 @@ pub enum Command {
         objects: Arc<[NeighbourObject]>,
         /// Time at which the objects had the ages that they state.
         stated_at: Timestamp,
-    },
-    /// [`Aggregator::take_foreign`].
-    TakeForeign {
-        /// All counts of other cells about the present vehicles.
-        #[schemars(with = "serde_json::Value")]
-        reputations: Arc<ForeignReputations>,
     },
     /// [`Aggregator::resume`].
     Resume {
@@ -105,7 +99,6 @@ impl Aggregator {
             Command::TakeNeighbours { objects, stated_at } => {
                 self.take_neighbours(objects, *stated_at);
             }
-            Command::TakeForeign { reputations } => self.take_foreign(reputations),
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {
                 self.configure(

@@ -1,6 +1,5 @@
 mod accepted_by_receivers;
 mod configure;
-mod foreign;
 mod one_answer;
 
 use std::collections::BTreeSet;

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use super::marks::Marks;
 use super::record::Record;
 use super::statements::Statements;
-use super::{CellCounts, Counts, Evidence, RememberedVotes, ReputationConfig};
+use super::{Counts, Evidence, RememberedVotes, ReputationConfig};
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
-use crate::wire::{ForeignVotes, LedgerMark, Reputation};
+use crate::wire::{LedgerMark, Reputation};
 
 /// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -166,36 +166,20 @@ impl ReputationLedger {
     /// The reputations to publish: scores from the kept votes by [`ReputationConfig::mean`], 0.30
     /// to 1.00, and the counts of all votes.
     pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
-        self.reputations_beside(config, &BTreeMap::new())
-    }
-
-    /// The same reputations, including votes of other cells, by [`ReputationConfig::mean_with`].
-    pub fn reputations_beside(
-        &self,
-        config: &ReputationConfig,
-        foreign: &BTreeMap<NodeName, ForeignVotes>,
-    ) -> BTreeMap<NodeName, Reputation> {
-        let (mut totals, latest) = (self.totals(), self.latest(config.memory_votes));
-        foreign
-            .keys()
-            .for_each(|node| _ = totals.entry(node.clone()).or_default());
+        let latest = self.latest(config.memory_votes);
         let reputation = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
             let latest = latest.get(&node).copied().unwrap_or_default();
-            let foreign = foreign.get(&node).copied();
-            let score = config
-                .mean_with(latest.0, latest.1, foreign.unwrap_or_default())
-                .clamp(0.30, 1.00);
+            let score = config.mean(latest.0, latest.1).clamp(0.30, 1.00);
             (
                 node,
                 Reputation {
                     score,
                     correct,
                     incorrect,
-                    foreign,
                 },
             )
         };
-        totals.into_iter().map(reputation).collect()
+        self.totals().into_iter().map(reputation).collect()
     }
 
     /// (correct, incorrect) among each vehicle's `memory_votes` latest votes.
@@ -207,29 +191,6 @@ impl ReputationLedger {
             *sum = (sum.0 + correct, sum.1 + incorrect);
         }
         latest
-    }
-
-    /// The counts of each vehicle to send to other cells; the `memory_votes` latest votes count as
-    /// kept.
-    pub fn cell_counts(&self, memory_votes: f64) -> BTreeMap<NodeName, CellCounts> {
-        let latest = self.latest(memory_votes);
-        let counts = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
-            let (right, wrong) = latest.get(&node).copied().unwrap_or_default();
-            let older = |all: u64, latest: f64| all.saturating_sub(latest.ceil() as u64);
-            let old = Counts {
-                correct: older(correct, right),
-                incorrect: older(incorrect, wrong),
-            };
-            (
-                node,
-                CellCounts {
-                    reset_at: self.reset_at,
-                    all: Counts { correct, incorrect },
-                    old,
-                },
-            )
-        };
-        self.totals().into_iter().map(counts).collect()
     }
 
     /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest,

@@ -17,7 +17,7 @@ use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::wire::{ForeignVotes, ObjectReport, PerceivedObject, WirePose};
+use crate::wire::{ObjectReport, PerceivedObject, WirePose};
 
 /// Distance of a vehicle from where it was, as a share of its range, up to which it stays. Without a pose, it is that of the
 /// median of its detections.
@@ -37,8 +37,6 @@ pub(super) struct Sensors {
     ids: HashMap<NodeName, SensorId>,
     pub(super) fleet: Fleet,
     pub(super) dormant: DormantCounts,
-    /// Votes of other cells, also about vehicles that are not heard yet.
-    foreign: BTreeMap<NodeName, ForeignVotes>,
 }
 
 impl Sensors {
@@ -49,7 +47,6 @@ impl Sensors {
             ids: HashMap::new(),
             fleet: Fleet::new(reputation),
             dormant: DormantCounts::default(),
-            foreign: BTreeMap::new(),
         }
     }
 
@@ -75,11 +72,7 @@ impl Sensors {
             let id = SensorId(number as u32);
             let counts = self.dormant.of(node);
             self.ids.insert(node.clone(), id);
-            self.fleet.set_foreign(
-                id,
-                self.foreign.get(node).copied().unwrap_or_default(),
-                &counts,
-            );
+            self.fleet.set_counts(id, &counts);
             Box::new(SensorModel::new(id, node.clone(), at, counts, config))
         });
         (model, &mut self.fleet)
@@ -136,15 +129,6 @@ impl Sensors {
         }
         self.dormant = DormantCounts::default();
         self.dormant.keep(votes);
-    }
-
-    /// Takes all votes of other cells.
-    pub(super) fn set_foreign(&mut self, votes: BTreeMap<NodeName, ForeignVotes>) {
-        self.foreign = votes;
-        for sensor in self.models.iter().flatten() {
-            let foreign = self.foreign.get(&sensor.node).copied().unwrap_or_default();
-            self.fleet.set_foreign(sensor.id, foreign, &sensor.counts);
-        }
     }
 
     /// Counts evidence about vehicles that are heard.

@@ -19,8 +19,7 @@ use crate::model::time::Timestamp;
 use crate::neighbours::MAX_AGE;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{
-    ForeignVotes, FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject,
-    PoseCorrection,
+    FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject, PoseCorrection,
 };
 
 /// Tracks objects; see the [module](super).
@@ -107,12 +106,6 @@ impl Tracker {
     /// Takes evidence of VOTE about vehicles that are heard.
     pub fn learn(&mut self, evidence: &[Evidence]) {
         self.sensors.learn(evidence);
-    }
-
-    /// Takes the votes of other cells, by the weight in votes of the prior beside which they count.
-    pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
-        let votes = votes_beside(self.sensors.fleet.reputation().initial_votes);
-        self.sensors.set_foreign(votes);
     }
 
     /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.

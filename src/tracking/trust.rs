@@ -13,7 +13,6 @@ use super::handles::SensorId;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::ReputationConfig;
-use crate::wire::ForeignVotes;
 
 /// Minimum log-odds, by the others' evidence, of an object that exists.
 const EXISTS_NATS: f64 = 2.0;
@@ -143,12 +142,7 @@ impl TrustCounts {
 
     /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
     pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
-        self.trust_beside(ForeignVotes::default(), config)
-    }
-
-    /// The same beside votes of other cells.
-    fn trust_beside(&self, foreign: ForeignVotes, config: &ReputationConfig) -> f64 {
-        let reputation = config.mean_with(self.correct, self.incorrect, foreign);
+        let reputation = config.mean(self.correct, self.incorrect);
         ((reputation / config.initial - WORTHLESS) / (1.0 - WORTHLESS)).clamp(0.0, 1.0)
     }
 }
@@ -194,8 +188,6 @@ pub(super) struct Fleet {
     reputation: ReputationConfig,
     /// Weight of the evidence of each vehicle by its id, 0 to 1.
     trust: Vec<f64>,
-    /// Votes of other cells about each vehicle by its id.
-    foreign: Vec<ForeignVotes>,
     /// By distance, the number of vehicles that detected an object that exists, and of all.
     detections: Vec<(f64, f64)>,
 }
@@ -213,7 +205,6 @@ impl Fleet {
         Self {
             reputation,
             trust: Vec::new(),
-            foreign: Vec::new(),
             detections: vec![(0.0, 1.0); Self::BINS],
         }
     }
@@ -235,33 +226,15 @@ impl Fleet {
 
     /// Sets the counts from which a vehicle's trust follows.
     pub(super) fn set_counts(&mut self, sensor: SensorId, counts: &TrustCounts) {
-        self.make_room(sensor);
         let number = sensor.number();
-        self.trust[number] = counts.trust_beside(self.foreign[number], &self.reputation);
-    }
-
-    /// Sets the votes of other cells about a vehicle with these counts.
-    pub(super) fn set_foreign(
-        &mut self,
-        sensor: SensorId,
-        foreign: ForeignVotes,
-        counts: &TrustCounts,
-    ) {
-        self.make_room(sensor);
-        self.foreign[sensor.number()] = foreign;
-        self.set_counts(sensor, counts);
-    }
-
-    fn make_room(&mut self, sensor: SensorId) {
-        let room = self.trust.len().max(sensor.number() + 1);
+        let room = self.trust.len().max(number + 1);
         self.trust.resize(room, 0.0);
-        self.foreign.resize(room, ForeignVotes::default());
+        self.trust[number] = counts.trust(&self.reputation);
     }
 
     /// Removes a vehicle.
     pub(super) fn forget(&mut self, sensor: SensorId) {
         self.trust[sensor.number()] = 0.0;
-        self.foreign[sensor.number()] = ForeignVotes::default();
     }
 
     /// Adds a statement to a vehicle's counts.

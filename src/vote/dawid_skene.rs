@@ -19,7 +19,6 @@ use super::label_map::LabelIndex;
 use super::likelihood::{
     LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability,
 };
-use crate::wire::ForeignVotes;
 
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
@@ -30,9 +29,6 @@ pub(super) struct VehicleEvidence {
     pub(super) settled: Confusion,
     /// Fading evidence from the ledger of other aggregators.
     pub(super) inherited: Confusion,
-    /// Votes of other cells. They weight the vehicle's statements, but are not evidence for
-    /// conclusions about it.
-    pub(super) foreign: ForeignVotes,
     /// Cumulative sum of the drop in the vehicle's rate of right votes.
     shortfall: f64,
     /// Probability of being right, as of the last [`DawidSkene::refresh`].
@@ -278,9 +274,8 @@ impl DawidSkene {
         let (fleet, prior) = (self.fleet_accuracy(), self.config.vehicle_prior_votes);
         for vehicle in vehicles {
             let evidence = &mut self.vehicles[vehicle];
-            let right = evidence.correct() + evidence.foreign.correct;
-            let votes = evidence.votes() + evidence.foreign.total();
-            evidence.accuracy = ((right + prior * fleet) / (votes + prior)).clamp(1e-6, 1.0 - 1e-6);
+            let accuracy = (evidence.correct() + prior * fleet) / (evidence.votes() + prior);
+            evidence.accuracy = accuracy.clamp(1e-6, 1.0 - 1e-6);
         }
     }
 
@@ -420,16 +415,6 @@ impl DawidSkene {
         let prior = self.config.vehicle_prior_votes;
         let fleet = self.fleet_accuracy().min(self.config.assumed_accuracy);
         (evidence.correct() + prior * fleet) / (evidence.votes() + prior)
-    }
-
-    /// The reliability including votes of other cells: a vehicle's weight. Conclusions from
-    /// evidence use [`Self::reliability`], so that other cells' counts alone cannot void evidence.
-    pub(super) fn reliability_beside(&self, vehicle: usize) -> f64 {
-        let evidence = &self.vehicles[vehicle];
-        let prior = self.config.vehicle_prior_votes;
-        let own = evidence.votes() + prior;
-        (own * self.reliability(vehicle) + evidence.foreign.correct)
-            / (own + evidence.foreign.total())
     }
 }
 

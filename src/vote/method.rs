@@ -6,7 +6,7 @@ use super::config::VoteConfig;
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::wire::{ForeignVotes, Reputation, Verdict};
+use crate::wire::{Reputation, Verdict};
 
 /// A vote before it is counted.
 #[derive(Debug, Clone, Copy)]
@@ -76,9 +76,6 @@ pub(super) trait VotingMethod {
 
     /// See [`super::Vote::adopt`].
     fn adopt(&mut self, _ledger: &ReputationLedger, _limits: &VoteConfig) {}
-
-    /// See [`super::Vote::set_foreign`].
-    fn set_foreign(&mut self, _votes_beside: &dyn Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {}
 
     /// See [`super::Vote::resume`].
     fn resume(&mut self, _reputations: &BTreeMap<NodeName, Reputation>) {}

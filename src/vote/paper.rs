@@ -63,7 +63,6 @@ impl PaperVoting {
             score: self.config.initial_reputation,
             correct: 0,
             incorrect: 0,
-            foreign: None,
         };
         self.vehicles
             .entry(node.clone())

@@ -24,7 +24,7 @@ use super::visibility;
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
-use crate::wire::{ForeignVotes, Reputation, Verdict};
+use crate::wire::{Reputation, Verdict};
 
 /// Minimum weight of a statement among the vehicle's own statements.
 const MIN_WEIGHT: f64 = 0.01;
@@ -47,7 +47,6 @@ pub(super) struct WeightedVoting {
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
     /// Votes of other cells, also about vehicles that have not voted yet.
-    foreign: BTreeMap<NodeName, ForeignVotes>,
     labels: LabelTable,
     landmarks: LandmarkTable,
     /// Indices of the landmarks to evaluate when the round closes.
@@ -95,7 +94,6 @@ impl WeightedVoting {
             self.names.len() - 1
         };
         self.vehicles.insert(node.clone(), vehicle);
-        self.model.vehicles[vehicle].foreign = self.foreign.get(node).copied().unwrap_or_default();
         vehicle
     }
 
@@ -181,7 +179,7 @@ impl WeightedVoting {
 
     fn score(&self, vehicle: usize) -> f64 {
         self.model
-            .reliability_beside(vehicle)
+            .reliability(vehicle)
             .clamp(REPUTATION_RANGE.0, REPUTATION_RANGE.1)
     }
 }
@@ -380,8 +378,6 @@ impl VotingMethod for WeightedVoting {
                 score: self.score(vehicle),
                 correct: correct + live_correct,
                 incorrect: incorrect + (live.total().round() as u64).saturating_sub(live_correct),
-                foreign: Some(self.model.vehicles[vehicle].foreign)
-                    .filter(|foreign| foreign.total() > 0.0),
             }
         };
         self.vehicles
@@ -420,13 +416,5 @@ impl VotingMethod for WeightedVoting {
 
     fn adopt(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
         self.take_over(ledger, limits);
-    }
-
-    fn set_foreign(&mut self, votes_beside: &dyn Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
-        self.foreign = votes_beside(self.config.vehicle_prior_votes);
-        for (node, &vehicle) in &self.vehicles {
-            self.model.vehicles[vehicle].foreign =
-                self.foreign.get(node).copied().unwrap_or_default();
-        }
     }
 }

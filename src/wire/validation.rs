@@ -9,10 +9,10 @@ use serde::de::DeserializeOwned;
 
 use super::codec;
 use super::{
-    CellDescription, CellMap, CellReputation, Encoding, FieldOfView, FusedObject, GlobalMap,
-    LandmarkState, LedgerShare, MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus,
-    ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations,
-    SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose,
+    CellDescription, CellMap, Encoding, FieldOfView, FusedObject, GlobalMap, LandmarkState,
+    LedgerShare, MAX_DISMISSED, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport,
+    PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION,
+    Trouble, Verdict, Verdicts, WirePose,
 };
 use crate::model::geometry::{Covariance, HEADING_BOUND_RAD};
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
@@ -168,7 +168,6 @@ payloads! {
     ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
     GlobalMap: at most map_bytes, checked by check_map, entries by invalid_of_map;
     CellMap: at most map_bytes, checked by check_cell_map, entries by invalid_of_cell_map;
-    CellReputation: at most payload_bytes, checked by check_cell_reputation;
     Verdicts: at most map_bytes, checked by check_verdicts, entries by invalid_verdicts;
     Reputations: at most map_bytes, checked by check_reputations, entries by invalid_reputations;
     CellDescription: at most map_bytes, checked by check_description;
@@ -430,32 +429,7 @@ fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), Reject
 
 fn check_reputation(reputation: &Reputation) -> Result<(), RejectReason> {
     check_integers([reputation.correct, reputation.incorrect])?;
-    let foreign = reputation.foreign.unwrap_or_default();
-    check_between(foreign.correct, 0.0, SCORE_BOUND)?;
-    check_between(foreign.incorrect, 0.0, SCORE_BOUND)?;
     check_between(reputation.score, 0.0, 1.0)
-}
-
-fn check_cell_reputation(counts: &CellReputation, _: &Limits) -> Result<(), RejectReason> {
-    let CellReputation {
-        correct,
-        incorrect,
-        old_correct,
-        old_incorrect,
-        reset_at_us,
-        ..
-    } = *counts;
-    check_integers(
-        [correct, incorrect]
-            .into_iter()
-            .chain(reset_at_us.map(Timestamp::micros)),
-    )?;
-    let is_possible = old_correct <= correct && old_incorrect <= incorrect;
-    if is_possible {
-        Ok(())
-    } else {
-        Err(RejectReason::Implausible)
-    }
 }
 
 fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {

@@ -14,9 +14,7 @@ use ecod::model::geometry::HEADING_BOUND_RAD;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::Landmark;
-use ecod::reputation::{
-    CellCounts, Evidence, ForeignReputations, ReputationConfig, ReputationLedger,
-};
+use ecod::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use ecod::vote::VoteMode;
 use ecod::wire::{
     CellDescription, ContentHash, DescriptionStatus, Encoding, LedgerEntry, LedgerMark,
@@ -245,35 +243,8 @@ proptest! {
             prop_assert!(reputations.contains_key(&entry.node), "{} has no reputation", entry.node);
         }
         check_accepted(&published(&Epoch::new(7, edge.clone()), reputations))?;
-        for (vehicle, counts) in ledger.cell_counts(config.memory_votes) {
-            check_accepted(&counts.message(NodeName::from_static("lot-1"), vehicle))?;
-        }
         for share in LedgerResync::new(edge, 10).snapshot(&ledger) {
             check_accepted(&share)?;
-        }
-    }
-
-    #[test]
-    fn any_counts_of_other_cells_make_reputations_that_every_receiver_accepts(
-        stated in vec((0..20u8, name(), count(), count(), any::<bool>()), 1..40),
-    ) {
-        let mut foreign = ForeignReputations::default();
-        for (cell, vehicle, correct, incorrect, is_old) in stated {
-            let cell = NodeName::new(format!("cell-{cell}")).unwrap();
-            let mut counts = CellCounts::default();
-            (counts.all.correct, counts.all.incorrect) = (correct, incorrect);
-            if is_old {
-                counts.old.correct = correct / 2;
-            }
-            let message = counts.message(cell.clone(), vehicle.clone());
-            check_accepted(&message)?;
-            foreign.merge(&cell, &vehicle, CellCounts::from(&message));
-        }
-        for initial_votes in [1e-3, 10.0, 1e6] {
-            let config = ReputationConfig { initial_votes, ..ReputationConfig::default() };
-            let votes = foreign.votes(initial_votes, |_| 1.0);
-            let reputations = ReputationLedger::default().reputations_beside(&config, &votes);
-            check_accepted(&published(&Epoch::new(7, NodeName::from_static("edge")), reputations))?;
         }
     }
 

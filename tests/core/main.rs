@@ -4,7 +4,6 @@
 mod accepted_by_receivers;
 mod examples;
 mod messages;
-mod moving_on;
 mod pace;
 mod replays;
 mod rooms;

@@ -9,11 +9,11 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    BoxCamera, BoxReport, CellDescription, CellMap, CellReputation, ClientRefusal, ClientRefusals,
-    ContentHash, DescriptionStatus, FieldOfView, ForeignVotes, FusedObject, GlobalMap,
-    LabelReading, LandmarkState, LedgerEntry, LedgerMark, LedgerShare, LedgerSignature,
-    NeighbourObject, NodeState, NodeStatus, ObjectReport, PerceivedObject, PixelBox,
-    PoseCorrection, Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
+    BoxCamera, BoxReport, CellDescription, CellMap, ClientRefusal, ClientRefusals, ContentHash,
+    DescriptionStatus, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState,
+    LedgerEntry, LedgerMark, LedgerShare, LedgerSignature, NeighbourObject, NodeState, NodeStatus,
+    ObjectReport, PerceivedObject, PixelBox, PoseCorrection, Reputation, Reputations, Role,
+    Trouble, Verdict, Verdicts, WirePose,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -257,29 +257,8 @@ fn reputations() {
                     score: 0.8,
                     correct: 40,
                     incorrect: 2,
-                    foreign: Some(ForeignVotes {
-                        correct: 12.5,
-                        incorrect: 0.5,
-                    }),
                 },
             )]),
-        },
-    );
-}
-
-#[test]
-fn cell_reputation() {
-    check(
-        "cell_reputation",
-        &CellReputation {
-            schema: 1,
-            cell: name("lot-1"),
-            vehicle: name("euclid"),
-            correct: 40,
-            incorrect: 2,
-            old_correct: 10,
-            old_incorrect: 1,
-            reset_at_us: Some(AT),
         },
     );
 }
@@ -387,7 +366,6 @@ fn every_message_has_a_snapshot() {
         "BoxReport",
         "CellDescription",
         "CellMap",
-        "CellReputation",
         "ClientRefusals",
         "GlobalMap",
         "LedgerShare",

@@ -4,7 +4,7 @@
 //! Gateway ── reports ──> LatestReportQueue ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
 //! Gateway ── TakeReports ──────────> │ ▲
 //! Follower ── TakeMap ─────────────> │ │
-//! Uplink ── TakeNeighbours, … ─────> │ │ ── SetPresent ──> Uplink
+//! Uplink ── TakeNeighbours ────────> │ │
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
@@ -15,7 +15,6 @@ mod report_queue;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -37,7 +36,6 @@ pub use report_queue::{LatestReportQueue, PushOutcome, QueuedReport};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::messages::uplink::UplinkMessage;
 use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -62,8 +60,6 @@ pub struct FuserArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Receives the evidence of rounds about vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
-    /// Receives the present vehicles, if the node has an uplink.
-    pub uplink: ActorSlot<UplinkMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -84,9 +80,6 @@ pub struct FuserState {
     cell_offset_us: i64,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
-    uplink: ActorSlot<UplinkMessage>,
-    /// The present vehicles as last sent to the uplink.
-    present: BTreeSet<NodeName>,
     counters: Arc<Counters>,
     /// The newest map of another aggregator or an earlier run, and its time of receipt.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
@@ -151,10 +144,6 @@ impl Actor for Fuser {
             FuserMessage::TakeNeighbours { objects, stated_at } => {
                 state.command(Command::TakeNeighbours { objects, stated_at });
             }
-            FuserMessage::TakeForeign { reputations } => {
-                state.command(Command::TakeForeign { reputations });
-            }
-            FuserMessage::TellUplink => state.present.clear(),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
             FuserMessage::Timeliness { reply } => {
@@ -215,7 +204,6 @@ impl FuserState {
             clock,
             gateway,
             keeper,
-            uplink,
             counters,
             spans,
         } = arguments;
@@ -227,8 +215,6 @@ impl FuserState {
             cell_offset_us: 0,
             gateway,
             keeper,
-            uplink,
-            present: BTreeSet::new(),
             counters,
             last_map: newest,
             alarm: Timestamp(u64::MAX),
@@ -418,7 +404,6 @@ impl FuserState {
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.reports = RoundReports::default();
-        self.present.clear();
         self.keeper.send(ReputationKeeperMessage::Lead {
             epoch: epoch.clone(),
             last_round: first_round.saturating_sub(1),
@@ -501,11 +486,6 @@ impl FuserState {
                 reputations,
             });
         }
-        if let Some(votes) = self.aggregator.take_foreign_news() {
-            self.keeper
-                .send(ReputationKeeperMessage::SetForeign { round, votes });
-        }
-        self.tell_uplink(now);
     }
 
     /// Counts entries that this node left out of its map or verdicts, by the vehicles whose
@@ -535,21 +515,6 @@ impl FuserState {
                     ),
                 });
             }
-        }
-    }
-
-    /// Informs the uplink when the set of present vehicles has changed.
-    fn tell_uplink(&mut self, now: Timestamp) {
-        if self.uplink.get().is_none() {
-            return;
-        }
-        let present = self.aggregator.present(now);
-        if present != self.present
-            && self.uplink.send(UplinkMessage::SetPresent {
-                vehicles: present.clone(),
-            })
-        {
-            self.present = present;
         }
     }
 

@@ -5,8 +5,6 @@
 //! Gateway ── Merge ────────────────>   │ ▲      │ └──── Adopt, Resume ──> Fuser
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //!          └ <── EvidenceReceived ──
-//! Fuser ── SetForeign ─────────────>   │
-//! Uplink ── TellUplink ────────────>   └── TellCounts ──> Uplink
 //! ```
 //!
 //! With certificates, this actor signs the counts of its node, and verifies other nodes' counts.
@@ -18,7 +16,6 @@
 //! [`ReputationStore`] outlives the actor, and the state directory the node.
 
 mod config;
-mod region;
 mod store;
 
 use std::collections::BTreeMap;
@@ -49,7 +46,6 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
-use crate::messages::uplink::UplinkMessage;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
@@ -58,7 +54,6 @@ use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
-use region::ToldCounts;
 use store::Saved;
 
 /// Arguments of a keeper's start.
@@ -89,8 +84,6 @@ pub struct ReputationKeeperArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// Is notified of accepted evidence of other candidates.
     pub election: ActorSlot<LeaderElectionMessage>,
-    /// Receives the counts for the region, if the node has an uplink.
-    pub uplink: ActorSlot<UplinkMessage>,
     /// The cell's time, used for checking resets.
     pub clock: CellClock,
     /// The node's counters.
@@ -112,7 +105,6 @@ pub struct ReputationKeeperState {
     published: Option<(Epoch, u64)>,
     writer: StateWriter,
     unadopted: bool,
-    told: ToldCounts,
     /// Tasks that end with the actor.
     tasks: JoinSet<()>,
 }
@@ -154,10 +146,7 @@ impl Actor for ReputationKeeper {
                 state.save().await;
                 state.publish();
                 state.send_snapshot();
-                state.tell_all();
             }
-            ReputationKeeperMessage::SetForeign { round, votes } => state.set_foreign(round, votes),
-            ReputationKeeperMessage::TellUplink => state.tell_all(),
             ReputationKeeperMessage::Record {
                 epoch,
                 round,
@@ -224,7 +213,6 @@ impl ReputationKeeperState {
             published: None,
             writer,
             unadopted: false,
-            told: ToldCounts::default(),
             tasks: JoinSet::new(),
         }
     }
@@ -267,7 +255,6 @@ impl ReputationKeeperState {
     ) {
         if !evidence.is_empty() || reputations.is_some() {
             self.writer.note_change();
-            self.told.is_due = true;
         }
         let mut store = self.arguments.reputations.open();
         let shares = self.resync.record(epoch, evidence, &mut store.ledger);
@@ -370,8 +357,6 @@ impl ReputationKeeperState {
     async fn settle(&mut self) {
         self.save().await;
         self.publish();
-        self.told.is_due |= self.unadopted;
-        self.tell_uplink();
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.reputations.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });

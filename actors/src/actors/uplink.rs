@@ -4,13 +4,11 @@
 //! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
 //! LeaderElection ── SetStatus ─────────────────────> │ ▲
 //! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
-//!                                                    └── TakeNeighbours, TakeForeign ──> Fuser
-//! Fuser ── SetPresent, ReputationKeeper ── TellCounts ──> Uplink ── CellReputation ──> region's broker
+//!                                                    └── TakeNeighbours ──> Fuser
 //! ```
 //!
 //! - The cell does not depend on the uplink: without the region the cell continues, and maps are
-//!   not kept for later. Counts about vehicles are kept: the latest counts of each vehicle wait
-//!   until the region has them.
+//!   not kept for later.
 //! - Only the leader is connected. A new leader connects when it starts to lead, so that a last
 //!   will always belongs to a leader.
 //! - Retained messages of a former leader may come late. The current leader then repeats its own.
@@ -18,7 +16,6 @@
 mod config;
 mod pace;
 mod region_link;
-mod reputations;
 
 use std::sync::Arc;
 
@@ -29,7 +26,7 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::neighbours::{MAX_AGE, Neighbours, ReputationExchange};
+use ecod::neighbours::{MAX_AGE, Neighbours};
 use ecod::wire::{
     CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION,
 };
@@ -41,13 +38,10 @@ pub use config::UplinkConfig;
 
 use self::pace::MapPace;
 use self::region_link::{RegionLink, RegionLinkSetup};
-use self::reputations::EXCHANGE_PERIOD;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::newest::ReceivedMap;
-use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
-use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::link::{LinkId, LinkSink};
@@ -76,12 +70,8 @@ pub struct UplinkArguments {
     pub newest: watch::Receiver<Option<ReceivedMap>>,
     /// The current leadership.
     pub leadership: watch::Receiver<Leadership>,
-    /// Receives the objects of neighbours and other cells' counts about vehicles.
+    /// Receives the objects of neighbours.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Source of this cell's counts about vehicles.
-    pub keeper: ActorSlot<ReputationKeeperMessage>,
-    /// The cell's time, in which resets are dated.
-    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// Seed of the jitter between connection attempts.
@@ -108,7 +98,6 @@ pub struct UplinkState {
     neighbours: Option<Neighbours>,
     /// True if a neighbour's map was accepted since the last message to the fuser.
     has_news: bool,
-    exchange: ReputationExchange,
     watcher: JoinHandle<()>,
 }
 
@@ -127,7 +116,6 @@ impl Actor for Uplink {
             arguments.newest.clone(),
             myself.clone(),
         ));
-        myself.send_interval(EXCHANGE_PERIOD, || UplinkMessage::Exchange);
         let mut state = UplinkState::new(arguments, watcher);
         state.look(&myself);
         Ok(state)
@@ -154,13 +142,7 @@ impl Actor for Uplink {
                     state.take_map(&topic, *map, delivery.received_at);
                 }
                 FromRegion::Status(status) => state.hear_status(&status),
-                FromRegion::Reputation(message) => {
-                    state.take_reputation(&message, delivery.received_at, &myself);
-                }
             },
-            UplinkMessage::SetPresent { vehicles } => state.set_present(&vehicles),
-            UplinkMessage::TellCounts { counts } => state.count_vehicles(counts),
-            UplinkMessage::Exchange => state.exchange_reputations(),
             UplinkMessage::LinkChanged { event } => {
                 let link = state.link.as_mut().filter(|link| link.id() == event.link);
                 if link.is_some_and(|link| link.change(event.change)) {
@@ -178,11 +160,7 @@ impl Actor for Uplink {
     ) -> Result<(), ActorProcessingErr> {
         state.watcher.abort();
         if let Some(link) = state.link.take() {
-            link.close(
-                state.farewell().as_ref(),
-                state.exchange.farewell(clock::now()),
-            )
-            .await;
+            link.close(state.farewell().as_ref()).await;
         }
         Ok(())
     }
@@ -195,7 +173,6 @@ impl UplinkState {
                 .origin
                 .map(|origin| Neighbours::new(setup.cell.clone(), origin)),
             has_news: false,
-            exchange: ReputationExchange::new(setup.cell.clone()),
             seen: None,
             connection: setup.config.connection(&setup.mqtt),
             pace: MapPace::new(setup.config.max_hz),
@@ -248,8 +225,6 @@ impl UplinkState {
             counters,
             seed: self.setup.seed,
         };
-        self.setup.fuser.send(FuserMessage::TellUplink);
-        self.setup.keeper.send(ReputationKeeperMessage::TellUplink);
         let id = LinkId(self.next_link);
         self.next_link += 1;
         self.pace = MapPace::new(self.setup.config.max_hz);
@@ -264,9 +239,7 @@ impl UplinkState {
 
     fn leave(&mut self, link: RegionLink) {
         let last = self.farewell();
-        let reputations = self.exchange.farewell(clock::now());
-        self.exchange = ReputationExchange::new(self.setup.cell.clone());
-        tokio::spawn(async move { link.close(last.as_ref(), reputations).await });
+        tokio::spawn(async move { link.close(last.as_ref()).await });
     }
 
     /// The last status of a node that leaves the region; `None` if another node leads, because that
@@ -286,7 +259,6 @@ impl UplinkState {
 
     /// Publishes the initial messages on a new connection.
     fn introduce(&mut self) {
-        self.exchange.connect();
         self.publish_status();
         if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);

@@ -11,7 +11,7 @@ use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
-use ecod::reputation::{ForeignReputations, ReputationLedger};
+use ecod::reputation::ReputationLedger;
 use ecod::wire::{GlobalMap, NeighbourObject, Reputation};
 use ractor::RpcReplyPort;
 
@@ -41,13 +41,6 @@ pub enum FuserMessage {
         /// Time at which the objects had the ages that they state.
         stated_at: Timestamp,
     },
-    /// Derive the initial reputation of vehicles from other cells' counts.
-    TakeForeign {
-        /// All counts of other cells about the present vehicles.
-        reputations: Arc<ForeignReputations>,
-    },
-    /// Send the set of present vehicles to the uplink again.
-    TellUplink,
     /// Close the round if it is due.
     CloseRound,
     /// Publish from now on.

@@ -1,5 +1,4 @@
-//! Requests to the actor `ReputationKeeper`, from the fuser, the gateway, the election and the
-//! uplink.
+//! Requests to the actor `ReputationKeeper`, from the fuser, the gateway and the election.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -7,7 +6,7 @@ use std::sync::Arc;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
-use ecod::wire::{ForeignVotes, LedgerShare, Reputation};
+use ecod::wire::{LedgerShare, Reputation};
 
 use crate::transport::mqtt::Delivery;
 
@@ -32,15 +31,6 @@ pub enum ReputationKeeperMessage {
         /// In VOTE's `paper` mode, the reputations after it.
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     },
-    /// Publish scores that include these votes of other cells.
-    SetForeign {
-        /// The round from which on they count.
-        round: u64,
-        /// All votes of other cells, with their weight here.
-        votes: BTreeMap<NodeName, ForeignVotes>,
-    },
-    /// Send the uplink all counts for other cells, and later changes.
-    TellUplink,
     /// Stop publishing.
     StepDown,
     /// Continue with other parameters of reputations.

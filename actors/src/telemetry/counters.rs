@@ -132,13 +132,6 @@ pub enum Event {
     /// An object of a neighbouring cell was not used: outside of the area that its cell may report,
     /// or beyond the maximum number.
     NeighbourRefused,
-    /// The cell's counts about a vehicle were handed to the connection to the region's broker.
-    CellReputationPublished,
-    /// Counts of another cell about a present vehicle were accepted and contained news.
-    CellReputationAccepted,
-    /// Counts about a vehicle that has left were not sent to the region: too many are waiting for
-    /// its broker.
-    CellReputationDropped,
 }
 
 impl Event {

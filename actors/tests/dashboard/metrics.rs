@@ -132,7 +132,7 @@ fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
 /// The page has words for everything that is counted and is not as it should be, and Grafana shows it and nothing else.
 #[test]
 fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
-    const USUAL: [Event; 20] = [
+    const USUAL: [Event; 18] = [
         Event::Published,
         Event::Received,
         Event::Echo,
@@ -149,8 +149,6 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
         Event::RegionPublished,
         Event::RegionReceived,
         Event::CellMapAccepted,
-        Event::CellReputationPublished,
-        Event::CellReputationAccepted,
         Event::FrameDetected,
         Event::FrameShown,
     ];

@@ -9,7 +9,6 @@ mod neighbours;
 mod outage;
 mod refusals;
 mod region;
-mod reputations;
 
 use std::time::Duration;
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
-use ecod::wire::{RegionTopic, RegionTopicKind, ReputationTopic, Topic, Topics};
+use ecod::wire::{RegionTopic, RegionTopicKind, Topic, Topics};
 
 const REGENERATE: &str =
     "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test programs schema::";
@@ -77,16 +77,7 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         cell: NodeName::from_static("cell"),
         kind,
     });
-    let of_vehicle = ReputationTopic {
-        vehicle: node,
-        cell: NodeName::from_static("cell"),
-    };
-    let spoken = &spoken
-        | &of_region
-            .iter()
-            .map(RegionTopic::path)
-            .chain([of_vehicle.path()])
-            .collect();
+    let spoken = &spoken | &of_region.iter().map(RegionTopic::path).collect();
     let addresses = values(&document, "address: ", '\n');
     let documented: BTreeSet<_> = addresses
         .iter()

@@ -50,7 +50,6 @@ fn false_reputations(after: &GlobalMap, ahead: u64) -> Reputations {
             score: 1.0,
             correct: 9,
             incorrect: 0,
-            foreign: None,
         },
     )]
     .into();

@@ -17,7 +17,7 @@ from ecod import codec, messages
 
 # Names that differ; shares are among candidates only, maps of cells and their word on vehicles among cells.
 CLASS_OF = {"WirePose": "Pose"}
-LEFT_OUT = {"CellMap", "CellReputation", "ClientRefusals", "LedgerShare"}
+LEFT_OUT = {"CellMap", "ClientRefusals", "LedgerShare"}
 
 
 @pytest.fixture(scope="module")

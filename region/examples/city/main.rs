@@ -10,7 +10,6 @@ mod fleet;
 mod places;
 mod probe;
 mod real;
-mod vehicles;
 mod watch;
 
 use std::path::PathBuf;
@@ -28,7 +27,6 @@ use cluster::{Cluster, SERVERS};
 use fleet::Fleet;
 use probe::Meter;
 use real::RealCells;
-use vehicles::PassingVehicles;
 use watch::Watch;
 
 /// Flags of the city.
@@ -59,9 +57,6 @@ struct Arguments {
 
 /// Maximum time until a city is whole again.
 const PATIENCE: Duration = Duration::from_secs(120);
-
-/// Maximum number of simulated cells that tell of vehicles.
-const TELLERS: usize = 20;
 
 /// Time before a measurement.
 const SETTLE: Duration = Duration::from_secs(5);
@@ -100,8 +95,6 @@ fn main() -> anyhow::Result<()> {
         "  maps that counted though they were too old, while all logged in for the first time: {}",
         at_start.len()
     );
-    let vehicles =
-        PassingVehicles::start(&simulated[..simulated.len().min(TELLERS)], &city.cluster)?;
 
     println!("\nserver 3 killed");
     let at = clock::now();
@@ -145,12 +138,6 @@ fn main() -> anyhow::Result<()> {
     city.overview()?;
     city.note_too_old("all servers were killed");
 
-    let (passed, lost) = vehicles.end(&city.cluster.login(0, "region.reader"))?;
-    println!(
-        "\nvehicles that passed through cells meanwhile: {passed}, reputations lost: {}",
-        lost.len()
-    );
-
     let too_old = city.too_old;
     println!(
         "\nmaps that counted though they were too old, since then: {}",
@@ -161,11 +148,6 @@ fn main() -> anyhow::Result<()> {
         "{} maps were too old: {:?}",
         too_old.len(),
         too_old.iter().take(10)
-    );
-    ensure!(
-        lost.is_empty(),
-        "reputations were lost: {:?}",
-        lost.iter().take(20)
     );
     Ok(())
 }

@@ -2,11 +2,10 @@ use super::*;
 use crate::model::geometry::Covariance;
 use crate::model::origin::GeographicOrigin;
 use crate::wire::{
-    CellDescription, CellMap, CellReputation, ContentHash, DescriptionStatus, Encoding,
-    FieldOfView, ForeignVotes, FusedObject, GlobalMap, LabelReading, LandmarkState, Limits,
-    NeighbourObject, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection,
-    Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode,
-    encode,
+    CellDescription, CellMap, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject,
+    GlobalMap, LabelReading, LandmarkState, Limits, NeighbourObject, NodeState, NodeStatus,
+    ObjectReport, Payload, PerceivedObject, PoseCorrection, Reputation, Reputations, Role,
+    SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode, encode,
 };
 
 fn report() -> ObjectReport {
@@ -182,39 +181,14 @@ fn every_field_of_every_payload_survives() {
         score: 0.625,
         correct: 410,
         incorrect: 22,
-        foreign: None,
     };
-    let foreign = Some(ForeignVotes {
-        correct: 0.5,
-        incorrect: 4.5,
-    });
-    let reputations = [
-        (node("euclid"), reputation),
-        (
-            node("gauss"),
-            Reputation {
-                foreign,
-                ..reputation
-            },
-        ),
-    ]
-    .into();
+    let reputations = [(node("euclid"), reputation)].into();
     survives(&Reputations {
         schema: SCHEMA_VERSION,
         aggregator: Some(node("edge")),
         epoch: 3,
         round: 88,
         reputations,
-    });
-    survives(&CellReputation {
-        schema: SCHEMA_VERSION,
-        cell: node("lot-1"),
-        vehicle: node("euclid"),
-        correct: 10_410,
-        incorrect: 22,
-        old_correct: 9_920,
-        old_incorrect: 12,
-        reset_at_us: Some(fused_at_us),
     });
     let text = "[[landmarks]]\n".to_owned();
     survives(&CellDescription {

@@ -8,8 +8,7 @@ use super::*;
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::wire::{
-    Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries,
-    encode,
+    Encoding, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries, encode,
 };
 
 fn edge() -> NodeName {
@@ -105,7 +104,6 @@ fn reputations() -> Reputations {
         score: 0.62,
         correct: 410,
         incorrect: 22,
-        foreign: None,
     };
     let reputations = [(edge(), reputation)].into();
     Reputations {
@@ -114,19 +112,6 @@ fn reputations() -> Reputations {
         epoch: 3,
         round: 88,
         reputations,
-    }
-}
-
-fn cell_reputation() -> CellReputation {
-    CellReputation {
-        schema: SCHEMA_VERSION,
-        cell: edge(),
-        vehicle: edge(),
-        correct: 410,
-        incorrect: 22,
-        old_correct: 400,
-        old_incorrect: 20,
-        reset_at_us: None,
     }
 }
 
@@ -372,38 +357,6 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|r| edges(r).score = -0.1, RejectReason::OutOfRange),
             (|r| edges(r).correct = u64::MAX, RejectReason::OutOfRange),
             (|r| edges(r).incorrect = 1 << 53, RejectReason::OutOfRange),
-            (
-                |r| {
-                    edges(r).foreign = Some(ForeignVotes {
-                        correct: -1.0,
-                        incorrect: 0.0,
-                    });
-                },
-                RejectReason::OutOfRange,
-            ),
-            (
-                |r| {
-                    edges(r).foreign = Some(ForeignVotes {
-                        correct: 0.0,
-                        incorrect: f64::NAN,
-                    });
-                },
-                RejectReason::NotFinite,
-            ),
-        ],
-    );
-    each_flaw_has_its_reason(
-        cell_reputation,
-        &[
-            (|r| r.schema = 2, RejectReason::UnknownSchema),
-            (|r| r.correct = 1 << 53, RejectReason::OutOfRange),
-            (|r| r.incorrect = u64::MAX, RejectReason::OutOfRange),
-            (
-                |r| r.reset_at_us = Some(Timestamp(u64::MAX)),
-                RejectReason::OutOfRange,
-            ),
-            (|r| r.old_correct = 411, RejectReason::Implausible),
-            (|r| r.old_incorrect = 23, RejectReason::Implausible),
         ],
     );
     each_flaw_has_its_reason(

@@ -36,7 +36,6 @@ fn standby() -> FuserState {
         clock: CellClock::default(),
         gateway: ActorSlot::default(),
         keeper: ActorSlot::default(),
-        uplink: ActorSlot::default(),
         counters: Arc::default(),
         spans: spans(),
     })

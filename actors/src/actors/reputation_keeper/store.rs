@@ -11,8 +11,8 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
 use ecod::wire::{
-    ForeignVotes, InvalidEntry, LedgerEntry, LedgerMark, LedgerShare, Payload, Reputation,
-    Reputations, SCHEMA_VERSION,
+    InvalidEntry, LedgerEntry, LedgerMark, LedgerShare, Payload, Reputation, Reputations,
+    SCHEMA_VERSION,
 };
 use serde::{Deserialize, Serialize};
 
@@ -28,9 +28,6 @@ pub struct ReputationStore {
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
     pub standing: BTreeMap<NodeName, Reputation>,
-    /// Votes of other cells with their weight here. They are not saved, because the region keeps
-    /// them.
-    pub(super) foreign: BTreeMap<NodeName, ForeignVotes>,
     pub(super) by_evidence: bool,
     restored: bool,
 }
@@ -38,7 +35,7 @@ pub struct ReputationStore {
 impl ReputationStore {
     pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         if self.by_evidence {
-            self.ledger.reputations_beside(config, &self.foreign)
+            self.ledger.reputations(config)
         } else {
             self.standing.clone()
         }
@@ -136,7 +133,6 @@ impl SharedReputations {
         let store = ReputationStore {
             ledger: Default::default(),
             standing: BTreeMap::new(),
-            foreign: BTreeMap::new(),
             by_evidence,
             restored: false,
         };

@@ -7,8 +7,7 @@ use ecod::leadership::Position;
 use ecod::leadership::cell_time::ClockReading;
 use ecod::leadership::timers::EVIDENCE_TRIAL;
 use ecod::model::time::Timestamp;
-use ecod::reputation::CellCounts;
-use ecod::wire::{ForeignVotes, LedgerEntry};
+use ecod::wire::LedgerEntry;
 use tempfile::TempDir;
 
 use super::*;
@@ -89,7 +88,6 @@ fn arguments(
         gateway: gateway.clone(),
         fuser: ActorSlot::default(),
         election: ActorSlot::default(),
-        uplink: ActorSlot::default(),
         clock: CellClock::default(),
         counters: Arc::clone(counters),
     }
@@ -689,73 +687,4 @@ async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
         ["gauss", "edge"],
         "a signature alone may be an old one"
     );
-}
-
-/// The uplink gets all counts when this node starts to lead, then the changes, and after a reset
-/// zero counts.
-#[tokio::test]
-async fn the_uplink_is_told_what_other_cells_are_to_know() {
-    let ((gateway, _published), (uplink, mut told)) =
-        (listening::slot().await, listening::slot().await);
-    let counters = Arc::<Counters>::default();
-    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
-        uplink,
-        ..arguments(&gateway, &counters)
-    });
-    let vote = |node: &str| Evidence {
-        node: name(node),
-        label: "cup".into(),
-        correct: false,
-    };
-    let mut counts = async || match told.recv().await {
-        Some(UplinkMessage::TellCounts { counts }) => {
-            let wrong = |(node, counts): (NodeName, CellCounts)| {
-                (node, counts.all.incorrect, counts.reset_at.micros())
-            };
-            counts.into_iter().map(wrong).collect::<Vec<_>>()
-        }
-        message => panic!("{message:?}"),
-    };
-    keeper.record(&Epoch::new(8, name("euclid")), 1, &[vote("gauss")], None);
-    keeper.tell_uplink();
-    assert_eq!(counts().await, [(name("gauss"), 1, 0)]);
-    keeper.record(&Epoch::new(8, name("euclid")), 2, &[vote("hertz")], None);
-    keeper.tell_uplink();
-    assert_eq!(counts().await, [(name("hertz"), 1, 0)], "what has changed");
-    keeper.tell_all();
-    assert_eq!(
-        counts().await,
-        [(name("gauss"), 1, 0), (name("hertz"), 1, 0)]
-    );
-
-    let mut reset = share("gauss", None, Vec::new()).map(Arc::unwrap_or_clone);
-    reset.message.reset_at_us = Some(Timestamp(7));
-    keeper.merge(&reset.map(Arc::new));
-    keeper.record(&Epoch::new(8, name("euclid")), 3, &[vote("hertz")], None);
-    keeper.settle().await;
-    assert_eq!(
-        counts().await,
-        [(name("hertz"), 1, 7), (name("gauss"), 0, 7)]
-    );
-    keeper.resync.step_down();
-    keeper.record(&Epoch::new(8, name("euclid")), 4, &[], None);
-    let votes = [(
-        name("gauss"),
-        ForeignVotes {
-            correct: 0.0,
-            incorrect: 5.0,
-        },
-    )]
-    .into();
-    keeper.set_foreign(9, votes);
-    let published = keeper
-        .arguments
-        .reputations
-        .open()
-        .reputations(&ReputationConfig::default());
-    assert!(
-        (published[&name("gauss")].score - 1.0 / 3.0).abs() < 1e-9,
-        "{published:?}"
-    );
-    assert!(published[&name("hertz")].foreign.is_none());
 }

@@ -10,10 +10,7 @@ use ecod::leadership::links::LinkState;
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::wire::{
-    CellDescription, CellMap, CellReputation, NodeStatus, RegionTopic, RegionTopicKind,
-    ReputationTopic, encode,
-};
+use ecod::wire::{CellDescription, CellMap, NodeStatus, RegionTopic, RegionTopicKind, encode};
 use uuid::Uuid;
 
 use crate::telemetry::counters::{Counters, Event};
@@ -25,9 +22,6 @@ use crate::transport::mqtt::{MqttConfig, Security};
 /// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node
 /// that stops waits for it.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// Time until a full queue may have room.
-const QUEUE_RETRY: Duration = Duration::from_millis(5);
 
 /// Materials of a link to the region's broker.
 pub(super) struct RegionLinkSetup {
@@ -119,40 +113,6 @@ impl RegionLink {
         self.tile
     }
 
-    /// True if the link is connected and the broker forwards messages.
-    pub(super) fn is_up(&self) -> bool {
-        self.link.state == LinkState::Up
-    }
-
-    /// Subscribes to these filters; false if there is no room.
-    pub(super) fn subscribe(&self, filters: &[String]) -> bool {
-        self.link
-            .client
-            .as_ref()
-            .is_some_and(|client| client.subscribe(filters, MaxQos::AtMostOnce))
-    }
-
-    /// Unsubscribes from these filters, as far as the queue has room; messages that still arrive
-    /// are ignored.
-    pub(super) fn unsubscribe(&self, filters: &[String]) {
-        if let Some(client) = &self.link.client
-            && !client.unsubscribe(filters)
-        {
-            tracing::debug!(broker = %self.link.broker, "no room to unsubscribe");
-        }
-    }
-
-    /// Publishes this cell's counts about a vehicle; returns false if the queue is full.
-    pub(super) fn publish_reputation(&self, message: &CellReputation) -> bool {
-        let topic = ReputationTopic {
-            vehicle: message.vehicle.clone(),
-            cell: message.cell.clone(),
-        };
-        let payload = Bytes::from(encode(message, self.setup.config.encoding));
-        self.link
-            .publish(&topic.path(), &payload, Retention::Retained)
-    }
-
     /// Processes an event of the link; returns true if the connection has just been established and
     /// has no published messages yet.
     pub(super) fn change(&mut self, change: LinkChange) -> bool {
@@ -228,31 +188,12 @@ impl RegionLink {
         );
     }
 
-    /// Ends the connection without the last will, after the remaining counts about vehicles and, if
-    /// given, after `last` as the retained status.
-    pub(super) async fn close(
-        mut self,
-        last: Option<&NodeStatus>,
-        reputations: Vec<CellReputation>,
-    ) {
-        let is_said =
-            tokio::time::timeout(LEAVE_TIMEOUT, self.publish_reputations(&reputations)).await;
-        if is_said.is_err() {
-            tracing::debug!(broker = %self.link.broker, "broker did not take all that was to be said of vehicles");
-        }
+    /// Ends the connection without the last will, after `last`, if given, as the retained status.
+    pub(super) async fn close(mut self, last: Option<&NodeStatus>) {
         if let Some(status) = last {
             self.publish_status(status);
         }
         self.link.leave(LEAVE_TIMEOUT).await;
-    }
-
-    /// Publishes this cell's counts about vehicles, as fast as the broker accepts them.
-    async fn publish_reputations(&self, messages: &[CellReputation]) {
-        for message in messages.iter().filter(|_| self.is_up()) {
-            while !self.publish_reputation(message) {
-                tokio::time::sleep(QUEUE_RETRY).await;
-            }
-        }
     }
 
     /// Ends the connection of a cell that has left its tile. If connected, first removes the cell's

@@ -321,7 +321,6 @@ impl NodeBuilder {
             gateway: self.slots.gateway.clone(),
             fuser: self.slots.fuser.clone(),
             election: self.slots.election.clone(),
-            uplink: self.slots.uplink.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
         }
@@ -351,7 +350,6 @@ impl NodeBuilder {
             clock: self.clock.clone(),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
-            uplink: self.slots.uplink.clone(),
             counters: self.counters(),
             spans: self.spans(),
         }

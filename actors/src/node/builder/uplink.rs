@@ -28,8 +28,6 @@ impl NodeBuilder {
             newest: self.newest.map.subscribe(),
             leadership: self.leadership(),
             fuser: self.slots.fuser.clone(),
-            keeper: self.slots.keeper.clone(),
-            clock: self.clock.clone(),
             counters: self.counters(),
             seed: self.run.as_u64_pair().0,
         })

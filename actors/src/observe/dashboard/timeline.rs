@@ -293,7 +293,6 @@ mod tests {
                 score,
                 correct: 3,
                 incorrect: 12,
-                foreign: None,
             };
             let reputations = [(NodeName::from_static("liar"), reputation)].into();
             Reputations {

@@ -1,6 +1,5 @@
 //! A region: a broker, and a subscriber to all that cells tell there.
 
-use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -8,8 +7,7 @@ use bytes::Bytes;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, CellMap, CellReputation, Limits, NodeStatus, Payload, RegionTopic,
-    RegionTopicKind, ReputationTopic, decode,
+    CellDescription, CellMap, Limits, NodeStatus, Payload, RegionTopic, RegionTopicKind, decode,
 };
 use ecod_actors::platform::clock;
 use ecod_actors::transport::mqtt::BrokerAddress;
@@ -89,8 +87,6 @@ impl Heard {
 /// A subscriber to all topics of the region that connects again after each break.
 pub(crate) struct Subscriber {
     heard: Arc<Mutex<Vec<Heard>>>,
-    /// The last word of each cell on each vehicle, by topic.
-    reputations: Arc<Mutex<BTreeMap<String, CellReputation>>>,
     client: AsyncClient,
     task: JoinHandle<()>,
 }
@@ -105,9 +101,7 @@ impl Subscriber {
         options.set_keep_alive(Duration::from_secs(60));
         let (client, mut events) = AsyncClient::new(options, 64);
         let heard = Arc::<Mutex<Vec<Heard>>>::default();
-        let reputations = Arc::<Mutex<BTreeMap<_, _>>>::default();
-        let (list, words, subscriber) =
-            (Arc::clone(&heard), Arc::clone(&reputations), client.clone());
+        let (list, subscriber) = (Arc::clone(&heard), client.clone());
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {
@@ -115,17 +109,10 @@ impl Subscriber {
                         subscriber
                             .try_subscribe("ecod/v1/geo/#", QoS::AtMostOnce)
                             .unwrap();
-                        subscriber
-                            .try_subscribe("ecod/v1/rep/#", QoS::AtMostOnce)
-                            .unwrap();
                     }
                     Ok(Event::Incoming(Incoming::Publish(publish)))
                         if !publish.payload.is_empty() =>
                     {
-                        if ReputationTopic::parse(&publish.topic).is_some() {
-                            let word = decode(&publish.payload, &Limits::default()).unwrap();
-                            words.lock().unwrap().insert(publish.topic.clone(), word);
-                        }
                         // Junk of a test's own is none of a cell's.
                         let Some(topic) = RegionTopic::parse(&publish.topic) else {
                             continue;
@@ -146,7 +133,6 @@ impl Subscriber {
         });
         Self {
             heard,
-            reputations,
             client,
             task,
         }
@@ -161,15 +147,6 @@ impl Subscriber {
             .publish(topic, QoS::AtMostOnce, false, payload.into())
             .await
             .unwrap();
-    }
-
-    /// The last counts of a cell about a vehicle.
-    pub(crate) fn reputation(&self, vehicle: &str, cell: &str) -> Option<CellReputation> {
-        self.reputations
-            .lock()
-            .unwrap()
-            .get(&format!("ecod/v1/rep/{vehicle}/{cell}"))
-            .cloned()
     }
 
     pub(crate) fn heard(&self) -> Vec<Heard> {

@@ -400,21 +400,12 @@ class Verdicts:
 
 
 @dataclass(frozen=True)
-class ForeignVotes:
-    """Votes of other cells about a vehicle, at the weight that they have in its score."""
-
-    correct: Margin
-    incorrect: Margin
-
-
-@dataclass(frozen=True)
 class Reputation:
-    """The trust in one vehicle and its evidence; `foreign` is what other cells say."""
+    """The trust in one vehicle and its evidence."""
 
     score: Fraction
     correct: Count
     incorrect: Count
-    foreign: Optional[ForeignVotes] = None
 
 
 @dataclass(frozen=True)

@@ -91,11 +91,9 @@ export function vehicles(entries, now, { troubles, nodes }) {
 
 export function reputations(received, colour) {
   const all = Object.entries(received?.message.reputations ?? {});
-  // Votes of other cells, as they count in the weight.
-  const beside = (count, foreign) => n(foreign ? `${count} + ${foreign.toFixed(1)} elsewhere` : count);
-  fill("reputations", all, ([name]) => name, ([name, { score, correct, incorrect, foreign }]) => [
+  fill("reputations", all, ([name]) => name, ([name, { score, correct, incorrect }]) => [
     { text: name, colour: colour.get(name) ?? 7 }, n(score.toFixed(2)),
-    beside(correct, foreign?.correct), beside(incorrect, foreign?.incorrect),
+    n(correct), n(incorrect),
   ]);
   byId("reputation-chart").hidden = all.length === 0;
 }
@@ -134,7 +132,6 @@ const DROPS = {
   client_throttled: "client refused: connects too often", client_timed_out: "client refused: login too late", client_untrusted: "client refused: no valid certificate",
   client_malformed: "client refused: malformed login", clients_full: "client refused: broker full", client_denied: "client request denied: no permission", client_stalled: "client disconnected: reads too slowly", client_expelled: "client disconnected: certificate revoked or expired",
   region_withheld: "map not sent to the region: link down or stalled", neighbour_refused: "neighbouring cell's object not used: elsewhere, or too many",
-  cell_reputation_dropped: "region not told of a vehicle: too many have left while its broker is away",
   overreached: "node declares more than its certificate allows",
   record_failed: "log cannot be written", record_dropped: "entry missing in the log",
   vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", entry_left_out: "object left out of the map: out of bounds, or too many of one vehicle", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
