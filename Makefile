@@ -116,7 +116,7 @@ test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
 test: setup ## [check] all tests
 ifeq ($(shell cargo nextest --version >/dev/null 2>&1 && echo nextest),nextest)
 	cargo nextest run --locked --test-threads $$((3 * $$(nproc))) $(TEST_FLAGS)
-	cargo test --locked --doc $(TEST_FLAGS)
+	$(if $(findstring --no-run,$(TEST_FLAGS)),,cargo test --locked --doc)
 else
 	cargo test --locked $(TEST_FLAGS)
 endif
