@@ -29,6 +29,20 @@ impl SpotScore {
         }
     }
 
+    /// Evaluates every spot of a map in `paper` mode, where a location without reports has no label:
+    /// that is right if the spot is free, whether or not a vehicle sees it.
+    pub fn judge_paper(&mut self, testbed: &Testbed, scene: &Scene, map: &GlobalMap) {
+        for spot in &scene.spots {
+            let state = map.landmarks.iter().find(|state| state.id == spot.id);
+            let label = state.and_then(|state| state.label.as_ref());
+            let free = &testbed.placard.empty_text;
+            self.count(
+                spot,
+                label.unwrap_or(free) == spot.truth.as_ref().unwrap_or(free),
+            );
+        }
+    }
+
     /// Evaluates every spot by its verdict. A spot without a label counts as wrong, because there
     /// were no votes for the placard of a free spot.
     pub fn judge_verdicts(&mut self, testbed: &Testbed, scene: &Scene, verdicts: &Verdicts) {

@@ -62,11 +62,13 @@ impl Trial<'_> {
             let all: Vec<_> = reports.values().flat_map(|cav| of_verdict(cav)).collect();
             for (aggregator, score) in [
                 (&mut fused, &mut score),
-                (&mut by_paper, &mut paper),
                 (&mut voting, &mut votes),
                 (&mut agreeing, &mut answers),
             ] {
                 self.judge(aggregator, all.clone(), score);
+            }
+            if let Some(map) = fuse(&mut by_paper, all).and_then(|fused| fused.map) {
+                paper.judge_paper(self.testbed, self.scene, &map);
             }
             for (name, cav) in reports {
                 if let Some((aggregator, score)) = alone.get_mut(name) {
