@@ -201,7 +201,9 @@ fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
     };
     match lead_us {
         0.. => format!("its clock is {lead} ahead"),
-        _ if report.clock_error_us.is_some() => format!("they arrive {lead} after the capture"),
+        _ if report.clock_error_us.is_some() => {
+            format!("its reports arrive {lead} after the capture")
+        }
         _ => format!("its clock is {lead} behind, or its reports take that long"),
     }
 }

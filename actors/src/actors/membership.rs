@@ -278,7 +278,7 @@ impl MembershipState {
                     certificate,
                     body,
                 } => {
-                    self.on_renewal(from, certificate, &body);
+                    self.on_renewal(from, &certificate, &body);
                     None
                 }
             };
@@ -298,13 +298,13 @@ impl MembershipState {
     }
 
     /// Processes a message about a renewed certificate.
-    fn on_renewal(&mut self, from: NodeName, certificate: Arc<[u8]>, body: &[u8]) {
+    fn on_renewal(&mut self, from: NodeName, certificate: &[u8], body: &[u8]) {
         let Ok(message) = postcard::from_bytes(body) else {
             return self.counters.count(FrameEvent::Malformed);
         };
         let renewals = self.renewals.as_mut();
         let step = renewals
-            .and_then(|renewals| renewals.on_message(from, &certificate, message, clock::now()));
+            .and_then(|renewals| renewals.on_message(from, certificate, message, clock::now()));
         self.take_step(step);
     }
 
