@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks renewal soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -145,6 +145,9 @@ joining: setup ## three machines, in network namespaces, become a cell by the co
 clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
 	cargo test --release --locked --test trials -- --ignored --exact clocks::all --nocapture
+
+renewal: setup ## a cell of real nodes whose certificates of three minutes are renewed twice: gaps of its maps
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice_without_a_missed_map --nocapture
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1

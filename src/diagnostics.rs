@@ -71,6 +71,8 @@ trouble_kinds! {
     ClockOff = "clock_off", SHORT, "run a time service on it, such as chrony";
     /// The camera delivers no frames.
     Camera = "camera", UNTIL_SETTLED, "`ecod-node doctor` tries the camera and names what is missing";
+    /// The detector takes longer for a frame than reports are accepted.
+    DetectorSlow = "detector_slow", UNTIL_SETTLED, "use smaller frames, another model or a faster machine";
     /// The pose of the camera is unavailable, so the detections in its frames cannot be placed.
     NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
     /// Detections of a label that has no size.
@@ -101,14 +103,18 @@ trouble_kinds! {
     NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
     /// More messages than are accepted.
     Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`; for more vehicles `fusion.window.max_vehicles`";
+    /// A client of this node's broker that neither reads nor sends.
+    NetworkCut = "network_cut", LONG, "look at the network between both, and whether its machine runs";
     /// A node of this cell with another key.
     WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";
     /// A node of a cell whose name is nearly this one's.
     OtherCell = "other_cell", LONG, "give both nodes the same `cell`, if they belong together";
     /// A node that cannot show a certificate which this one accepts.
     NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
-    /// The node's own certificate ends soon, or has ended.
-    CertificateEnds = "certificate_ends", UNTIL_SETTLED, "create a new one by `ecod-node pki issue`, and copy its two files here: no restart";
+    /// The node's own certificate ends soon, or has ended, and is not renewed.
+    CertificateEnds = "certificate_ends", UNTIL_SETTLED, "start a node that has the CA in `pki` beside its `tls.ca`, or create a new certificate by `ecod-node pki issue`, and copy its two files here: no restart";
+    /// The CA of the cell ends soon, or has ended.
+    CaEnds = "ca_ends", UNTIL_SETTLED, "give the cell a new CA: docs/security.md, key rotation";
     /// A second running node of a name.
     NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
     /// A former member does not answer, without an orderly stop and without a dismissal by an operator.
@@ -129,6 +135,8 @@ trouble_kinds! {
     CellLeftOut = "cell_left_out", UNTIL_SETTLED, "correct its entry in the file of `cells` and the files that it names: `ecod-node doctor` tries all";
     /// More troubles than are kept.
     NotShown = "not_shown", SHORT, "mend those that are shown, others then have room";
+    /// Entries that are missing in the log.
+    NotRecorded = "not_recorded", SHORT, "free space on the disk of `record.dir`, and make the directory writable for the node's user";
     /// State that cannot be saved.
     NotSaved = "not_saved", UNTIL_SETTLED, "free space on the disk, and make `state_dir` writable for the node's user";
 }
@@ -170,7 +178,10 @@ impl TroubleKind {
 
     /// True if a node with this trouble cannot do its work.
     pub fn is_disabling(self) -> bool {
-        matches!(self, Self::ReportsRefused | Self::Camera | Self::NoPose)
+        matches!(
+            self,
+            Self::ReportsRefused | Self::Camera | Self::DetectorSlow | Self::NoPose
+        )
     }
 
     /// True if this trouble, of any host, may be the reason why a node finds no leader or gets no

@@ -63,7 +63,7 @@ use crate::observe::dashboard::LiveState;
 use crate::observe::readiness::{SharedFacts, Vitals};
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
-use crate::transport::gossip::Member;
+use crate::transport::gossip::{FrameCounters, Member};
 use builder::{NodeBuilder, cause};
 use description::HeldDescription;
 use health_log::HealthLog;
@@ -145,6 +145,7 @@ pub struct NodeHandle {
     dashboard: watch::Receiver<Option<SocketAddr>>,
     slots: ActorSlots,
     counters: Arc<Counters>,
+    frames: Arc<FrameCounters>,
     live_state: Arc<LiveState>,
     shared: watch::Receiver<SharedFacts>,
     name: NodeName,
@@ -196,6 +197,7 @@ async fn start_with(
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
+    let frames = builder.frames();
     let (live_state, shared, name) = (
         builder.live_state(),
         builder.shared(),
@@ -218,6 +220,7 @@ async fn start_with(
         dashboard,
         slots,
         counters,
+        frames,
         live_state,
         shared,
         name,
@@ -286,6 +289,11 @@ impl NodeHandle {
     /// The node's counters.
     pub fn counters(&self) -> &Arc<Counters> {
         &self.counters
+    }
+
+    /// The counters of the node's datagrams.
+    pub fn frames(&self) -> &Arc<FrameCounters> {
+        &self.frames
     }
 
     /// Current troubles of the cell: troubles of this node, and troubles in other nodes' statuses.

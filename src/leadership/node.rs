@@ -366,10 +366,12 @@ impl LeadershipNode {
     /// declares a higher role or priority is not dropped: the permitted part is still used.
     fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
         let (from, declared) = (message.from.clone(), message.candidacy);
+        // Every follower vouches for its leader when it is asked; that counts only from a candidate.
+        let vouches = matches!(message.body, Body::LeaderEvidence { .. });
         let limited = rights.limit(message);
         if limited
             .as_ref()
-            .is_none_or(|message| message.candidacy != declared)
+            .map_or(!vouches, |message| message.candidacy != declared)
         {
             self.log(Notice::Overreached {
                 from,

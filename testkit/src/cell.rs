@@ -93,13 +93,29 @@ impl Cell {
     /// # Panics
     /// Panics if no such node runs.
     pub fn kill(&mut self, name: &str) {
-        let Running { node, runtime } = self.nodes.remove(name).unwrap();
+        let Running { node, runtime } = self.remove(name);
+        runtime.shutdown_background();
+        drop(node);
+    }
+
+    /// Stops a node in order.
+    ///
+    /// # Panics
+    /// Panics if no such node runs, or it panics.
+    pub async fn stop_node(&mut self, name: &str) {
+        let Running { node, runtime } = self.remove(name);
+        runtime.spawn(node.stop()).await.unwrap();
+        runtime.shutdown_background();
+    }
+
+    /// Takes a node out of the cell; another one is the seed from then on.
+    fn remove(&mut self, name: &str) -> Running {
+        let running = self.nodes.remove(name).unwrap();
         let other = self.nodes().next();
         self.seed = other.map_or_else(free_gossip_address, |(_, other)| {
             other.gossip_address().unwrap()
         });
-        runtime.shutdown_background();
-        drop(node);
+        running
     }
 
     /// Stops all nodes. Their files are in the directory.

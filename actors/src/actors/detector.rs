@@ -11,7 +11,7 @@
 
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
@@ -57,6 +57,8 @@ pub struct DetectorArguments {
     pub counters: Arc<Counters>,
     /// The spans of the vehicle's present node.
     pub spans: watch::Receiver<Spans>,
+    /// Age from which a report is refused.
+    pub max_age: Duration,
 }
 
 /// Runs the detection algorithm repeatedly on the latest frame.
@@ -72,6 +74,10 @@ pub struct DetectorState {
     mismatch: Option<SizeMismatch>,
     /// True if the detector failed on the last frame.
     failing: bool,
+    max_age: Duration,
+    /// Successive frames that took longer, and the frames skipped before them.
+    slow_frames: u32,
+    skipped_before: u64,
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
     camera_feed: Option<Arc<CameraFeed>>,
@@ -81,7 +87,10 @@ pub struct DetectorState {
     readers: Readers,
 }
 
-/// Duration of one frame from which a detector is reported as slow.
+/// Successive frames that take too long, from which a detector is reported as slow.
+const SLOW_FRAMES: u32 = 3;
+
+/// Duration of one frame from which a detector is reported as slow before the frame is done.
 const SLOW_AFTER: Duration = Duration::from_secs(5);
 const SLOW_DETECTOR: &str = "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
 
@@ -109,6 +118,7 @@ impl Actor for Detector {
             troubles,
             counters,
             spans,
+            max_age,
         } = arguments;
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
@@ -125,6 +135,9 @@ impl Actor for Detector {
             lens,
             mismatch: None,
             failing: false,
+            max_age,
+            slow_frames: 0,
+            skipped_before: 0,
             projector,
             images,
             camera_feed,
@@ -159,16 +172,19 @@ impl Actor for Detector {
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let (mut images, lens) = (state.images.take(), state.lens);
         let span = tracing::info_span!("detect");
-        let (detect, images, frame, outcome) = spawn_blocking(move || {
+        let (detect, images, frame, outcome, took) = spawn_blocking(move || {
+            let begun = Instant::now();
             let outcome = span.in_scope(|| detect.detect(&frame));
+            let took = begun.elapsed();
             drop(span);
             if let Some(images) = &mut images {
                 images.offer(&frame, &lens, outcome.as_deref().unwrap_or_default());
             }
-            (detect, images, frame, outcome)
+            (detect, images, frame, outcome, took)
         })
         .await?;
         (state.detect, state.images) = (Some(detect), images);
+        state.note_duration(took);
         match outcome {
             Ok(mut detections) => {
                 if std::mem::take(&mut state.failing) {
@@ -203,6 +219,25 @@ impl Actor for Detector {
 }
 
 impl DetectorState {
+    /// Records whether the detector is too slow, by the measured time of a frame.
+    fn note_duration(&mut self, took: Duration) {
+        if took < self.max_age {
+            self.slow_frames = 0;
+            self.skipped_before = self.counters.events(Event::FrameSkipped);
+            return self.troubles.settle(TroubleKind::DetectorSlow);
+        }
+        self.slow_frames += 1;
+        if self.slow_frames >= SLOW_FRAMES {
+            let skipped = self.counters.events(Event::FrameSkipped) - self.skipped_before;
+            let cause = format!(
+                "the detector takes {:.1} s for a frame and has skipped {skipped}: reports older than {:.1} s are not used",
+                took.as_secs_f64(),
+                self.max_age.as_secs_f64()
+            );
+            self.troubles.note(TroubleKind::DetectorSlow, &cause);
+        }
+    }
+
     /// Scales detections to the image size of the lens. Returns the lens; `None` for a frame of a
     /// shape that the lens does not accept.
     fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> Option<Lens> {
@@ -230,20 +265,13 @@ async fn pump(
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
     loop {
         let mut ready = pin!(Arc::clone(&permits).acquire_owned());
-        let mut is_slow = false;
         let permit = loop {
             match timeout(SLOW_AFTER, &mut ready).await {
                 Ok(Ok(permit)) => break permit,
                 Ok(Err(_)) => return,
-                Err(_) => {
-                    is_slow = true;
-                    troubles.note(TroubleKind::Camera, SLOW_DETECTOR);
-                }
+                Err(_) => troubles.note(TroubleKind::DetectorSlow, SLOW_DETECTOR),
             }
         };
-        if is_slow {
-            troubles.settle(TroubleKind::Camera);
-        }
         let frame = loop {
             let frame = tokio::select! {
                 frame = capture.next_frame() => Some(frame),
@@ -290,6 +318,7 @@ async fn pump(
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicU64, Ordering};
     use std::sync::mpsc::{Receiver, channel};
 
     use ecod::model::names::NodeName;
@@ -310,20 +339,28 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn a_detector_that_does_not_finish_a_frame_is_a_trouble_until_it_does() {
+    /// A model whose frames take the same time, which the test changes.
+    struct Steady(Arc<AtomicU64>);
+
+    impl Detect for Steady {
+        fn detect(&mut self, _: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
+            std::thread::sleep(Duration::from_millis(self.0.load(Ordering::Relaxed)));
+            Ok(Vec::new())
+        }
+    }
+
+    /// Arguments of a detector that gets ten frames a second, with reports that are used for 0.2 s.
+    fn arguments(detect: impl Detect + 'static, counters: &Arc<Counters>) -> DetectorArguments {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos").into();
         let source = SourceConfig::Images {
             path,
             fps: 10.0,
             looping: true,
         };
-        let (done, waits) = channel();
-        let counters = Arc::<Counters>::default();
-        let arguments = DetectorArguments {
+        DetectorArguments {
             open: Arc::new(move || source.open(Duration::from_secs(5))),
             capture: CaptureConfig::default(),
-            detect: Box::new(Slow(waits)),
+            detect: Box::new(detect),
             lens: Lens {
                 is_any_shape: true,
                 ..Lens::ideal(Intrinsics::with_square_pixels(640, 480, 1.0))
@@ -331,15 +368,52 @@ mod tests {
             projector: ActorSlot::default(),
             images: None,
             camera_feed: None,
-            troubles: CameraTroubles::new(Arc::clone(&counters), None),
-            counters: Arc::clone(&counters),
+            troubles: CameraTroubles::new(Arc::clone(counters), None),
+            counters: Arc::clone(counters),
             spans: watch::channel(Spans::new(
                 NodeName::from_static("cell"),
                 NodeName::from_static("euclid"),
             ))
             .1,
+            max_age: Duration::from_millis(200),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_detector_whose_reports_come_too_late_is_slow_by_its_measured_time() {
+        let (counters, frame_ms) = (Arc::<Counters>::default(), Arc::new(AtomicU64::new(300)));
+        let detector = arguments(Steady(Arc::clone(&frame_ms)), &counters);
+        let (detector, ended) = Actor::spawn(None, Detector, detector).await.unwrap();
+        let cause = || {
+            let mut troubles = counters.troubles().present().into_iter();
+            troubles.find_map(|it| (it.kind == "detector_slow").then_some(it.cause))
         };
-        let (detector, ended) = Actor::spawn(None, Detector, arguments).await.unwrap();
+        let until = async |is_slow: bool| {
+            while cause().is_some() != is_slow {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        timeout(Duration::from_secs(60), until(true)).await.unwrap();
+        let text = cause().unwrap();
+        assert!(
+            text.starts_with("the detector takes 0.3 s for a frame"),
+            "{text}"
+        );
+        assert!(counters.events(Event::FrameSkipped) > 0);
+        frame_ms.store(0, Ordering::Relaxed);
+        timeout(Duration::from_secs(60), until(false))
+            .await
+            .unwrap();
+        detector.stop(None);
+        ended.await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_detector_that_does_not_finish_a_frame_is_a_trouble_until_it_does() {
+        let (done, waits) = channel();
+        let counters = Arc::<Counters>::default();
+        let detector = arguments(Slow(waits), &counters);
+        let (detector, ended) = Actor::spawn(None, Detector, detector).await.unwrap();
         let until = async |is_slow: bool| {
             let is_told = || {
                 counters

@@ -169,6 +169,9 @@ const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 /// wrong: far more than the transit time of reports.
 const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 
+/// Remedy for late reports of a node that dates them in the cell's time: its clock is not the cause.
+const LATE_REMEDY: &str = "its detector or the link to it is slow: see that node's own troubles, or raise `fusion.window.max_age_s`";
+
 /// Remedy where times seem to be in another unit.
 const OTHER_UNIT_REMEDY: &str = "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970";
 
@@ -187,6 +190,9 @@ fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
     };
     match lead_us {
         0.. => format!("its clock is {lead} ahead"),
+        _ if report.clock_error_us.is_some() => {
+            format!("its reports arrive {lead} after the capture")
+        }
         _ => format!("its clock is {lead} behind, or its reports take that long"),
     }
 }
@@ -289,10 +295,12 @@ impl FuserState {
                         .troubles()
                         .settle(TroubleKind::ClockOff, Some(node));
                     let is_in_microseconds = TimeUnit::of(report.captured_at_us).is_none();
-                    let remedy = if is_in_microseconds {
-                        TroubleKind::Untimely.remedy()
-                    } else {
+                    let remedy = if !is_in_microseconds {
                         OTHER_UNIT_REMEDY
+                    } else if reason == RejectReason::Stale && report.clock_error_us.is_some() {
+                        LATE_REMEDY
+                    } else {
+                        TroubleKind::Untimely.remedy()
                     };
                     self.counters.troubles().note_with_remedy(
                         Some(node),

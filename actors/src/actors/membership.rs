@@ -8,6 +8,8 @@
 
 #![deny(clippy::indexing_slicing)]
 
+mod renewal;
+
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -24,7 +26,7 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use crate::messages::membership::MembershipMessage;
+use crate::messages::membership::{MembershipMessage, RenewalOutcome};
 use crate::platform::clock;
 use crate::transport::gossip::handshake::Identity;
 use crate::transport::gossip::key::{CellKey, SessionNonce};
@@ -35,7 +37,8 @@ use crate::transport::gossip::{
     EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig,
     MembershipEvent, MulticastConfig,
 };
-use crate::transport::pki::{Credentials, Distrust};
+use crate::transport::pki::{Credentials, Distrust, RenewalMessage};
+use renewal::{RenewalStep, Renewals};
 
 /// Arguments of a [`Membership`].
 pub struct MembershipArguments {
@@ -77,6 +80,9 @@ pub struct MembershipState {
     members: watch::Sender<Vec<Member>>,
     counters: Arc<FrameCounters>,
     certificates: Option<CertificateWatch>,
+    renewals: Option<Renewals>,
+    name: NodeName,
+    myself: ActorRef<MembershipMessage>,
     /// Tasks that end with the actor.
     _tasks: JoinSet<()>,
 }
@@ -109,7 +115,10 @@ impl Actor for Membership {
         log_who_can_take_part(&config, credentials.is_some(), address);
         let mut certificates = credentials.clone().map(CertificateWatch::new);
         let identity = certificates.as_mut().map(CertificateWatch::identity);
-        let now = clock::now();
+        let renewals = credentials
+            .clone()
+            .map(|credentials| Renewals::new(credentials, name.clone()));
+        let (now, own_name) = (clock::now(), name.clone());
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId {
             name,
@@ -156,8 +165,9 @@ impl Actor for Membership {
                     cause,
                 });
             };
+            let membership = myself.clone();
             let tell = move |addresses| {
-                myself
+                membership
                     .cast(MembershipMessage::SetSeeds { addresses })
                     .is_ok()
             };
@@ -178,6 +188,9 @@ impl Actor for Membership {
             members,
             counters,
             certificates,
+            renewals,
+            name: own_name,
+            myself,
             _tasks: tasks,
         })
     }
@@ -210,6 +223,17 @@ impl Actor for Membership {
                     // Nodes may have shown renewed certificates, for which there is no event.
                     state.tell_members();
                 }
+                let renewals = state.renewals.as_mut();
+                let step = renewals.and_then(|renewals| renewals.check(now));
+                state.take_step(step);
+            }
+            MembershipMessage::Renewal { outcome } => {
+                if matches!(outcome, RenewalOutcome::Answered { answer: Err(_), .. }) {
+                    state.counters.count(FrameEvent::RenewalRefused);
+                }
+                let renewals = state.renewals.as_mut();
+                let step = renewals.and_then(|renewals| renewals.on_outcome(outcome));
+                state.take_step(step);
             }
             MembershipMessage::Wake => state.wake(),
         }
@@ -249,6 +273,14 @@ impl MembershipState {
                     (self.events)(event);
                     None
                 }
+                GossipOutput::Renewal {
+                    from,
+                    certificate,
+                    body,
+                } => {
+                    self.on_renewal(from, &certificate, &body);
+                    None
+                }
             };
             match sent {
                 Some(Ok(())) => self.counters.count(FrameEvent::Sent),
@@ -263,6 +295,52 @@ impl MembershipState {
             self.tell_members();
         }
         self.deadline.send_replace(self.machine.next_deadline());
+    }
+
+    /// Processes a message about a renewed certificate.
+    fn on_renewal(&mut self, from: NodeName, certificate: &[u8], body: &[u8]) {
+        let Ok(message) = postcard::from_bytes(body) else {
+            return self.counters.count(FrameEvent::Malformed);
+        };
+        let renewals = self.renewals.as_mut();
+        let step = renewals
+            .and_then(|renewals| renewals.on_message(from, certificate, message, clock::now()));
+        self.take_step(step);
+    }
+
+    fn take_step(&mut self, step: Option<RenewalStep>) {
+        match step {
+            Some(RenewalStep::Send(to, message)) if to == self.name => {
+                let renewals = self.renewals.as_mut();
+                let step = renewals
+                    .and_then(|renewals| renewals.on_message(to, &[], message, clock::now()));
+                self.take_step(step);
+            }
+            Some(RenewalStep::Send(to, message)) => self.send_renewal(&to, &message),
+            Some(RenewalStep::SendToAll(message)) => {
+                let nodes = self.machine.members().into_iter();
+                for node in nodes.filter(|member| !member.name.is_part()) {
+                    self.send_renewal(&node.name, &message);
+                }
+            }
+            Some(RenewalStep::Work(work)) => {
+                let membership = self.myself.clone();
+                tokio::task::spawn_blocking(move || {
+                    // A membership that has ended needs no outcome.
+                    _ = membership.cast(MembershipMessage::Renewal { outcome: work() });
+                });
+            }
+            None => {}
+        }
+    }
+
+    fn send_renewal(&mut self, to: &NodeName, message: &RenewalMessage) {
+        match postcard::to_allocvec(message) {
+            Ok(body) if body.len() <= MAX_PAYLOAD_BYTES => {
+                self.machine.send_renewal(to, &body, clock::now());
+            }
+            _ => self.counters.count(FrameEvent::Oversized),
+        }
     }
 
     fn tell_members(&self) {

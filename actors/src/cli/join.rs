@@ -169,6 +169,7 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     directory.write(name, &welcome, &key_text)?;
     // The key is in the node's own file.
     std::fs::remove_file(&key).with_context(|| format!("cannot remove {}", key.display()))?;
+    directory.hand_over_pki()?;
     print(&format!(
         "made the cell {cell} and its node {name} in {directory}\n\
          keep {}/ca.key safe: whoever has it can let nodes in\n\
@@ -246,23 +247,34 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
     .into())
 }
 
-/// Gets and keeps the files of an invited node.
+/// Gets and keeps the files of an invited node, or new certificates for one that has joined before.
 pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
     let token = read_token(&arguments.token).map_err(Failure::usage)?;
-    let directory = arguments.node.directory.vacant()?;
+    let directory = arguments.node.directory.directory()?;
     let node = &token.node;
+    let resident = directory.resident(node).map_err(Failure::usage)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let cell = runtime.block_on(async {
         let joined = redeem(&token).await?;
-        directory.write(node, &joined.welcome, &joined.key)?;
+        match &resident {
+            Some(config) => directory.renew(config, &joined.welcome, &joined.key)?,
+            None => directory.write(node, &joined.welcome, &joined.key)?,
+        }
         let cell = joined.welcome.cell.clone();
         if let Err(error) = joined.keep().await {
-            directory.vacate()?;
+            if resident.is_none() {
+                directory.vacate()?;
+            }
             let again = "run `ecod-node join` again with the same token while `ecod-node invite` still runs there";
             return Err(anyhow!(error).context(format!("the host does not know that {node} has joined: {again}")));
         }
         anyhow::Ok(cell)
     })?;
+    if resident.is_some() {
+        return Ok(print(&format!(
+            "{node} has a new certificate of the cell {cell}; a running node uses it at once\n"
+        ))?);
+    }
     print(&format!(
         "{node} has joined the cell {cell}; its files are in {directory}\n"
     ))?;

@@ -11,10 +11,10 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
-use super::installation::{self, AUTHORITY_DIRECTORY};
+use super::installation::{self, AUTHORITY_DIRECTORY, ConfigurationArguments};
 use super::{Failure, print};
 use crate::platform::clock;
-use crate::transport::pki::{Authority, DEFAULT_DAYS};
+use crate::transport::pki::{Authority, Credentials, DEFAULT_DAYS, NewKey};
 
 /// Commands of `pki`.
 #[derive(Debug, Subcommand)]
@@ -50,6 +50,13 @@ pub(super) enum PkiCommand {
         /// Validity of the certificate in days
         #[arg(long, default_value_t = DEFAULT_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,
+    },
+    /// Issue the certificate of this machine's node again, also after its end; no restart
+    Renew {
+        #[command(flatten)]
+        ca: AuthorityDir,
+        #[command(flatten)]
+        node: ConfigurationArguments,
     },
     /// Revoke all certificates of a node
     Revoke {
@@ -148,6 +155,22 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
                 .issue(node, rights, validity(*days), now)
                 .map_err(failure)?;
             configuration(&authority, node)
+        }
+        PkiCommand::Renew { ca, node } => {
+            let mut authority = open(&installation::authority(ca.dir.as_deref()), false)?;
+            let (config, file) = node.load()?;
+            let (Some(tls), Some(name)) = (&config.tls, &config.name) else {
+                let file = file.display();
+                return Err(Failure::usage(anyhow!("{file} has no name or no `[tls]`")));
+            };
+            let credentials = Credentials::load(tls, name).map_err(failure)?;
+            NewKey::generate()
+                .map_err(failure)?
+                .reissue(&mut authority, &credentials)
+                .map_err(|reason| anyhow!(reason))?;
+            let renewed = Credentials::load(tls, name).map_err(failure)?;
+            let days = renewed.current().identity.expires().since(now).as_secs() / 86_400;
+            format!("renewed the certificate of {name}: it is valid for {days} days\n")
         }
         PkiCommand::Revoke { ca, node } => {
             let mut authority = open(&installation::authority(ca.dir.as_deref()), false)?;

@@ -8,6 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, anyhow};
 use chrono::DateTime;
 use clap::Args;
+use ecod::diagnostics::in_words;
 use ecod::model::time::Timestamp;
 use ecod::wire::Trouble;
 use serde_json::json;
@@ -135,8 +136,7 @@ fn text(running: &RunningNode) -> String {
         text += &format!("leader: {leader}, term {term}{standby}\n");
     }
     if let Some(ends) = node.certificate_ends_us {
-        let days = ends.since(clock::wall()).as_secs() / 86_400;
-        text += &format!("certificate: {days} days left\n");
+        text += &format!("certificate: {}\n", validity_text(ends));
     }
     for member in nodes {
         text += &format!("node: {}\n", member_text(member));
@@ -152,6 +152,17 @@ fn text(running: &RunningNode) -> String {
         text += &format!("trouble: {about}: {cause} -> {remedy}\n");
     }
     text
+}
+
+/// The end of the node's certificate. A running cell renews it before that.
+fn validity_text(ends: Timestamp) -> String {
+    let left = ends.since(clock::wall());
+    let date = date(ends).unwrap_or_default();
+    match left.as_secs() / 86_400 {
+        0 if left.is_zero() => format!("ended {date}"),
+        0 => format!("{} left, ends {date}", in_words(left)),
+        days => format!("{days} days left, ends {date}"),
+    }
 }
 
 fn member_text(member: &RunningMember) -> String {

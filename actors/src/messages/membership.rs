@@ -6,6 +6,22 @@ use bytes::Bytes;
 use ecod::model::names::NodeName;
 use ractor::RpcReplyPort;
 
+/// End of one step of a renewal, which was done beside the membership.
+#[derive(Debug)]
+pub enum RenewalOutcome {
+    /// This node has decided about another node's request.
+    Answered {
+        /// The other node.
+        to: NodeName,
+        /// Its request, by which a repeated one is recognised.
+        request: Vec<u8>,
+        /// Its new certificate in DER, or the reason for the refusal.
+        answer: Result<Vec<u8>, String>,
+    },
+    /// This node has replaced its own certificate, or the reason why not.
+    Replaced(Result<(), String>),
+}
+
 /// Requests to the membership.
 #[derive(Debug)]
 pub enum MembershipMessage {
@@ -29,6 +45,11 @@ pub enum MembershipMessage {
     /// Read changed certificates, and end sessions with an expired or revoked certificate; sent by
     /// the membership to itself.
     CheckCertificates,
+    /// A renewal of a certificate was decided; sent by the membership to itself.
+    Renewal {
+        /// The decision.
+        outcome: RenewalOutcome,
+    },
     /// Process waiting datagrams and due timers; sent by the membership to itself.
     Wake,
 }

@@ -1,6 +1,7 @@
 //! Counters of events, rejected payloads and shed messages; cheap enough for every packet.
 
 mod by_source;
+mod floods;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,7 +13,9 @@ use strum::{IntoStaticStr, VariantArray};
 pub use by_source::{OTHERS, Shed, ShedReason, SourceCount};
 
 use by_source::CountsBySource;
+use floods::Floods;
 
+use crate::platform::clock;
 use crate::telemetry::troubles::Troubles;
 
 /// An event that is too frequent for the log.
@@ -151,6 +154,8 @@ pub struct Counters {
     rejects: [AtomicU64; RejectReason::ALL.len()],
     rejects_by_source: CountsBySource<RejectReason>,
     shed: CountsBySource<ShedReason>,
+    floods: Floods<ShedReason>,
+    lasting_rejects: Floods<RejectReason>,
     troubles: Troubles,
 }
 
@@ -161,6 +166,8 @@ impl Default for Counters {
             rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
             rejects_by_source: CountsBySource::default(),
             shed: CountsBySource::default(),
+            floods: Floods::default(),
+            lasting_rejects: Floods::default(),
             troubles: Troubles::default(),
         }
     }
@@ -183,6 +190,15 @@ impl Counters {
         self.reject_message(reason, source, || {
             format!("message rejected: {}", reason.in_words())
         });
+    }
+
+    /// Counts a rejected payload that a change of leader explains, unless it goes on for long.
+    pub fn reject_if_lasting(&self, reason: RejectReason, source: &str) {
+        if self.lasting_rejects.is_flood(reason, source, clock::now()) {
+            self.reject(reason, source);
+        } else {
+            self.count_reject(reason, source);
+        }
     }
 
     /// Counts a rejected payload as [`Self::reject`] does, with the cause as text.
@@ -228,19 +244,30 @@ impl Counters {
         self.rejects_by_source.snapshot()
     }
 
-    /// Counts a message that was shed under overload.
+    /// Counts a message that was shed under overload. It is a trouble if it goes on for long.
     pub fn shed(&self, reason: ShedReason, source: &str) {
         self.shed.count(reason, source);
         let cause = match reason {
             ShedReason::ReaderSlow => "reads too slowly and misses the oldest messages",
             // A busy fuser uses the later report: the vehicle need not be informed.
             ShedReason::ReportReplaced => return,
+            _ if !self.floods.is_flood(reason, source, clock::now()) => return,
             _ => "sends more than is taken, the rest is not used",
         };
         self.troubles.note_about(
             source,
             TroubleKind::Overload,
             &format!("{cause} ({})", reason.as_str()),
+        );
+    }
+
+    /// Counts a message for a client of the broker that neither reads nor sends.
+    pub fn shed_cut_off(&self, source: &str) {
+        self.shed.count(ShedReason::ReaderSlow, source);
+        self.troubles.note_about(
+            source,
+            TroubleKind::NetworkCut,
+            "neither reads nor sends: the network to it is cut, or its machine stands still",
         );
     }
 

@@ -6,6 +6,7 @@
 //! CertificateSubject  the node that a certificate names, and its rights
 //! BrokerTrust         verification of a broker's certificate for as long as a connection lasts
 //! EvidenceSigner      signatures under evidence that is passed on
+//! NewKey              a node's next key, and the request for its certificate
 //! ```
 //!
 //! Each cell has its own CA, so that certificates of other cells are not valid in it. A city's CA
@@ -20,15 +21,17 @@ mod broker_trust;
 mod config;
 mod credentials;
 mod evidence;
+mod renewal;
 mod subject;
 
 pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
 pub(crate) use authority::check_name;
-pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
+pub use authority::{Authority, AuthorityError, DEFAULT_DAYS, RenewalRefusal};
 pub use broker_trust::{BrokerIdentity, BrokerTrust};
 pub use config::{CityTlsConfig, TlsConfig};
 pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
 pub use evidence::{EvidenceError, EvidenceSigner};
+pub(crate) use renewal::{NewKey, RenewalMessage, renew};
 pub use subject::{CertificateSubject, InvalidCertificate};
 
 /// DNS name in the certificate of every node that may lead, below a domain reserved for private

@@ -5,6 +5,8 @@ mod camera_cell;
 mod cell;
 mod description;
 mod failover;
+#[cfg(feature = "camera")]
+mod false_alarms;
 mod membership;
 #[cfg(feature = "camera")]
 mod moving_vehicle;

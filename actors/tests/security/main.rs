@@ -16,6 +16,7 @@ mod logins;
 mod nodes;
 mod packets;
 mod payloads;
+mod renewal;
 mod resources;
 mod revoked_client;
 mod shares;

@@ -2,7 +2,7 @@
 //!
 //! `make clocks` runs all trials and prints a table; every run of the tests has a reduced form.
 
-mod cell;
+pub(crate) mod cell;
 mod feeder;
 mod record;
 

@@ -9,6 +9,10 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::platform::clock;
+use ecod_actors::transport::pki::Authority;
 use ecod_testkit::{command, free_gossip_address};
 
 /// Maximum time for anything.
@@ -140,7 +144,7 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
     assert!(damaged.contains("not the whole of it"), "{damaged}");
     succeeds(&["join", for_gauss, "--dir", gauss]);
     let again = fails(&["join", for_gauss, "--dir", gauss]);
-    assert!(again.contains("belongs to a node already"), "{again}");
+    assert!(again.contains("the token was used already"), "{again}");
     let elsewhere = tempfile::tempdir().unwrap();
     let again = fails(&[
         "join",
@@ -280,4 +284,56 @@ fn init_and_invite_say_why_they_refuse() {
         reserved.contains("names of nodes have no `--`"),
         "{reserved}"
     );
+}
+
+/// A node's certificate that has ended, in place of the one that it has.
+fn let_end(pki: &Path, node: &str, role: Role, machine: &Path) {
+    let (name, day) = (NodeName::new(node).unwrap(), Duration::from_secs(86_400));
+    let mut authority = Authority::open(pki).unwrap();
+    let issued_at = clock::wall() - 10 * day;
+    authority.issue(&name, role, 9 * day, issued_at).unwrap();
+    let (certificate, key) = authority.files_of(&name);
+    fs::copy(certificate, machine.join("node.pem")).unwrap();
+    fs::copy(key, machine.join("node.key")).unwrap();
+}
+
+#[test]
+fn after_the_end_of_its_certificate_each_node_comes_back_by_one_command() {
+    let machines = ["edge", "gauss"].map(|_| tempfile::tempdir().unwrap());
+    let [edge, gauss] = machines
+        .each_ref()
+        .map(|machine| machine.path().to_str().unwrap());
+    let gossip = free_gossip_address().to_string();
+    succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
+    let (host, tokens) = invite(edge, &gossip, &["gauss"]);
+    succeeds(&["join", &tokens[0], "--dir", gauss]);
+    drop(host);
+    let pki = machines[0].path().join("pki");
+    let_end(&pki, "edge", Role::Edge, machines[0].path());
+    let_end(&pki, "gauss", Role::Auto, machines[1].path());
+
+    let [config, directory] = [machines[0].path().join("node.toml"), pki];
+    let [config, directory] = [&config, &directory].map(|path| path.to_str().unwrap());
+    let said = succeeds(&["pki", "renew", "--config", config, "--dir", directory]);
+    assert!(said.contains("renewed the certificate of edge"), "{said}");
+    let (_host, tokens) = invite(edge, &gossip, &["gauss"]);
+    let configuration = fs::read(machines[1].path().join("node.toml")).unwrap();
+    let said = succeeds(&["join", &tokens[0], "--dir", gauss]);
+    assert!(
+        said.contains("gauss has a new certificate of the cell lot-1"),
+        "{said}"
+    );
+    assert_eq!(
+        fs::read(machines[1].path().join("node.toml")).unwrap(),
+        configuration
+    );
+
+    let _nodes = [
+        run(Path::new(edge), &gossip),
+        run(Path::new(gauss), "127.0.0.1:0"),
+    ];
+    until("gauss gets maps of the edge", || {
+        let maps = fs::read_to_string(machines[1].path().join("maps")).unwrap_or_default();
+        maps.contains("\"aggregator\":\"edge\"")
+    });
 }

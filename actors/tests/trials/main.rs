@@ -12,5 +12,6 @@ mod network;
 mod packets;
 mod ports;
 mod process;
+mod renewal;
 #[path = "../security/shares.rs"]
 mod shares;

@@ -737,6 +737,27 @@ fn who_only_follows_declares_nothing_by_its_priority() {
     );
 }
 
+/// Vehicles and observers are asked for the leader's last sign of life, as all nodes are.
+#[test]
+fn a_follower_without_rights_that_vouches_for_its_leader_declares_nothing() {
+    let mut scene = Scene::new(Role::Auto, None);
+    let body = Body::LeaderEvidence {
+        ask: 1,
+        age_ms: 0,
+        life: LifeSign::default(),
+    };
+    let mut message = scene.message(Epoch::new(7, name("edge")), body);
+    (message.candidacy.role, message.candidacy.priority) = (Role::Cav, 100);
+    scene.take(Input::Receive {
+        from: name("edge"),
+        rights: Rights::NONE,
+        message,
+    });
+    let notices = scene.notices();
+    let is_overreach = |notice: &&Notice| matches!(notice, Notice::Overreached { .. });
+    assert!(!notices.iter().any(|notice| is_overreach(&notice)));
+}
+
 /// A leader hands leadership over to an `edge`, but not to a node that merely claims that role.
 #[test]
 fn a_declared_role_beyond_the_certificate_takes_no_lead() {

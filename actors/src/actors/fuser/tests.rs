@@ -188,6 +188,29 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
     );
 }
 
+/// A node dates its reports in the cell's time, so its clock does not make them late.
+#[test]
+fn late_reports_of_a_node_are_not_blamed_on_its_clock() {
+    let mut fuser = standby();
+    for n in 1..=20 {
+        let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        let captured_at = received_at - Duration::from_secs(3);
+        let mut report = ObjectReport::new(NodeName::from_static("late"), n, captured_at);
+        report.clock_error_us = Some(1000);
+        take(&mut fuser, report, received_at, None);
+    }
+    let troubles = fuser.counters.troubles().present();
+    let [trouble] = &troubles[..] else {
+        panic!("{troubles:?}")
+    };
+    assert_eq!(trouble.kind, "untimely");
+    assert_eq!(
+        trouble.cause,
+        "refused, its reports arrive 3.0 s after the capture"
+    );
+    assert_eq!(trouble.remedy, LATE_REMEDY);
+}
+
 /// Where objects are tracked, they may be anywhere near the locations: three metres, but not three
 /// hundred.
 #[test]

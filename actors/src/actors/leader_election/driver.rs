@@ -37,7 +37,7 @@ use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::troubles::Troubles;
 use crate::transport::gossip::{Member, MembershipEvent, is_of_this_machine};
-use crate::transport::pki::Credentials;
+use crate::transport::pki::{Credentials, DEFAULT_DAYS};
 
 /// The node's leadership and the destinations of its effects.
 pub struct ElectionDriver {
@@ -368,7 +368,9 @@ impl ElectionDriver {
     /// own certificate, and an unused description of the cell.
     fn note_troubles(&mut self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
+        let mut is_clock_wrong = false;
         for clock in self.cell_time.wrong_clocks(clock::now()) {
+            is_clock_wrong |= clock.node.is_none();
             if clock.node.is_none() || leadership.is_leading() {
                 let about = clock.node.map(NodeName::as_str);
                 troubles.note_with_remedy(
@@ -395,12 +397,9 @@ impl ElectionDriver {
             let cause = format!("{leader} says of this node: {cause}");
             troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
         }
-        let certificate = self.life_signs.credentials().map(Credentials::current);
-        let left =
-            certificate.and_then(|certificate| certificate.identity.due_for_renewal(clock::wall()));
-        match left {
-            Some(left) => troubles.note(TroubleKind::CertificateEnds, &ending(left)),
-            None => troubles.settle(TroubleKind::CertificateEnds, None),
+        if let Some(credentials) = self.life_signs.credentials() {
+            credentials.set_clock_wrong(is_clock_wrong);
+            note_certificates(credentials, troubles);
         }
         match &self.parts.shared.borrow().problem {
             Some(problem) => troubles.note(TroubleKind::Description, problem),
@@ -492,14 +491,35 @@ fn missing_words(absence: Duration, wall: Timestamp) -> String {
     format!("gone for {}{at}", in_words(absence))
 }
 
-/// The remaining validity of the node's own certificate as text.
-fn ending(left: Duration) -> String {
+/// Records that the node's certificate ends soon and is not renewed, and that the cell's CA ends.
+fn note_certificates(credentials: &Credentials, troubles: &Troubles) {
+    let (current, now) = (credentials.current(), clock::wall());
+    let left = current.identity.due_for_renewal(now);
+    match left.zip(credentials.unrenewed()) {
+        Some((left, why)) => {
+            let cause = format!("{}: {why}", ending("this node's certificate", left));
+            troubles.note(TroubleKind::CertificateEnds, &cause);
+        }
+        None => troubles.settle(TroubleKind::CertificateEnds, None),
+    }
+    match current.ca_validity.remaining_within(CA_MARGIN, now) {
+        Some(left) => troubles.note(TroubleKind::CaEnds, &ending("the cell's CA", left)),
+        None => troubles.settle(TroubleKind::CaEnds, None),
+    }
+}
+
+/// Remaining validity of the CA below which certificates that it issues end with it: their default
+/// validity.
+const CA_MARGIN: Duration = Duration::from_secs(DEFAULT_DAYS as u64 * 86_400);
+
+/// The remaining validity of a certificate as text.
+fn ending(what: &str, left: Duration) -> String {
     let count = |number: u64, unit: &str| {
         let plural = if number == 1 { "" } else { "s" };
-        format!("this node's certificate ends in {number} {unit}{plural}")
+        format!("{what} ends in {number} {unit}{plural}")
     };
     match left.as_secs() {
-        0 => "this node's certificate has ended".to_owned(),
+        0 => format!("{what} has ended"),
         seconds @ ..60 => count(seconds, "second"),
         seconds @ ..3600 => count(seconds / 60, "minute"),
         seconds @ ..86_400 => count(seconds / 3600, "hour"),

@@ -2,21 +2,22 @@
 
 use std::fmt;
 use std::fs::{self, DirBuilder};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, chown};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, lchown};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
+use serde_json::json;
 
 use crate::cli::installation;
-use crate::node::config::END_OF_CONFIGURATION;
 use crate::node::config::guidance::SERVICE_DIRECTORY;
+use crate::node::config::{END_OF_CONFIGURATION, NodeConfig};
 use crate::platform::bounded_file;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
-use crate::transport::pki::{CityTlsConfig, Credentials, TlsConfig};
+use crate::transport::pki::{CertificateSubject, CityTlsConfig, Credentials, TlsConfig};
 
 /// Directory of the service's state.
 const STATE_DIRECTORY: &str = "/var/lib/ecod";
@@ -77,6 +78,105 @@ impl NodeDirectory {
             path.display()
         );
         Ok(())
+    }
+
+    /// The configuration of the node in the directory; `None` if the directory is vacant.
+    ///
+    /// # Errors
+    /// Returns an error if it is another node's directory.
+    pub(super) fn resident(&self, node: &NodeName) -> anyhow::Result<Option<NodeConfig>> {
+        let Err(occupied) = self.check_vacant() else {
+            return Ok(None);
+        };
+        let config = NodeConfig::load(Some(&self.configuration()), &json!({}))?;
+        if config.name.as_ref() == Some(node) {
+            Ok(Some(config))
+        } else {
+            Err(occupied)
+        }
+    }
+
+    /// Replaces the certificates of the node in the directory by those of an invitation, such as
+    /// after their end.
+    pub(super) fn renew(
+        &self,
+        config: &NodeConfig,
+        welcome: &Welcome,
+        key: &str,
+    ) -> anyhow::Result<()> {
+        let (Some(tls), Some(node)) = (&config.tls, &config.name) else {
+            bail!("the node in {self} has no `[tls]`");
+        };
+        ensure!(
+            config.cell == welcome.cell,
+            "the node in {self} is of cell {}, and the token of {}",
+            config.cell,
+            welcome.cell
+        );
+        let rights = CertificateSubject::of_pem(&welcome.certificate)?.rights();
+        ensure!(
+            rights.allow(config.role, config.election.priority),
+            "the node has the role {} and priority {}, and is invited with less: `ecod-node invite --role {}`",
+            config.role,
+            config.election.priority,
+            config.role
+        );
+        let city = tls.city.as_ref().zip(welcome.city.as_ref());
+        let of_city = city.iter().flat_map(|(paths, city)| {
+            let list = paths.revocation_list.as_ref();
+            let list = list.map(|path| (path.clone(), city.revocation_list.as_str(), 0o644));
+            [(paths.ca.clone(), city.ca.as_str(), 0o644)]
+                .into_iter()
+                .chain(list)
+        });
+        let list = tls.revocation_list.as_ref();
+        let list = list.map(|path| (path.clone(), welcome.revocation_list.as_str(), 0o644));
+        self.put(of_city.chain(list).chain([
+            (tls.ca.clone(), welcome.ca.as_str(), 0o644),
+            (tls.certificate.clone(), welcome.certificate.as_str(), 0o644),
+            (tls.key.clone(), key, self.key_mode()),
+        ]))?;
+        Credentials::load(tls, node).context("the files do not fit together")?;
+        Ok(())
+    }
+
+    /// Permissions of the node's private key: programs of the service's group may use the node's
+    /// local broker, but are not members.
+    fn key_mode(&self) -> u32 {
+        if self.state_of_service.is_some() {
+            0o640
+        } else {
+            0o600
+        }
+    }
+
+    /// Writes files, each with its permissions; they belong to the service's user, if these are the
+    /// service's files.
+    fn put<'a>(&self, files: impl Iterator<Item = (PathBuf, &'a str, u32)>) -> anyhow::Result<()> {
+        for (path, text, mode) in files {
+            replace_file(&path, text.as_bytes(), mode)
+                .and_then(|()| self.hand_over(&path))
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Gives the CA to the service's user, whose node renews certificates.
+    pub(super) fn hand_over_pki(&self) -> anyhow::Result<()> {
+        let list = |directory: &Path| fs::read_dir(directory).map(|all| all.flatten());
+        let pki = self.pki();
+        let files = list(&pki).and_then(|files| Ok(files.chain(list(&pki.join("nodes"))?)));
+        let all = files.map(|files| files.map(|file| file.path()).chain([pki.clone()]));
+        all.and_then(|mut all| all.try_for_each(|path| self.hand_over(&path)))
+            .with_context(|| format!("cannot give {} to the service's user", pki.display()))
+    }
+
+    /// Gives a file to the service's user, if this is the service's directory.
+    fn hand_over(&self, path: &Path) -> std::io::Result<()> {
+        match self.state_of_service.as_ref().map(fs::metadata) {
+            Some(Ok(owner)) => lchown(path, Some(owner.uid()), Some(owner.gid())),
+            _ => Ok(()),
+        }
     }
 
     /// Makes the directory vacant again.
@@ -165,12 +265,6 @@ impl NodeDirectory {
             kept.transpose()
                 .context("cannot keep the former node.toml")?;
         }
-        // Programs of the service's group may use the node's local broker, but are not members.
-        let key_mode = if self.state_of_service.is_some() {
-            0o640
-        } else {
-            0o600
-        };
         let of_city = welcome.city.iter().flat_map(|city| {
             [
                 (CITY_CA, city.ca.as_str(), 0o644),
@@ -183,22 +277,10 @@ impl NodeDirectory {
             ("node.pem", welcome.certificate.as_str(), 0o644),
             ("revoked.pem", welcome.revocation_list.as_str(), 0o644),
             ("node.toml", configuration.as_str(), 0o640),
-            ("node.key", key, key_mode),
+            ("node.key", key, self.key_mode()),
             ("cell.key", welcome.cell_key.as_str(), 0o600),
         ]);
-        let owner = self
-            .state_of_service
-            .as_ref()
-            .and_then(|state| fs::metadata(state).ok());
-        for (name, text, mode) in files {
-            let path = file(name);
-            replace_file(&path, text.as_bytes(), mode)
-                .and_then(|()| match &owner {
-                    Some(owner) => chown(&path, Some(owner.uid()), Some(owner.gid())),
-                    None => Ok(()),
-                })
-                .with_context(|| format!("cannot write {}", path.display()))?;
-        }
+        self.put(files.map(|(name, text, mode)| (file(name), text, mode)))?;
         Credentials::load(&tls, node).context("the files do not fit together")?;
         Ok(())
     }

@@ -1,6 +1,7 @@
 //! Arguments and settings of the actors of the cameras.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context;
 
@@ -57,6 +58,7 @@ impl NodeBuilder {
             troubles: self.camera_troubles(camera),
             counters: self.counters(),
             spans: self.vehicle.spans.subscribe(),
+            max_age: Duration::from_secs_f64(self.config.fusion.window.max_age_s),
         })
     }
 

@@ -5,6 +5,7 @@ use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use ecod::aggregator::Command;
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
 use ecod::model::detection::Detection;
 use ecod::model::epoch::Epoch;
@@ -144,6 +145,7 @@ impl LogSender {
         };
         if let Some(lost) = lost {
             self.count_lost(1, u64::from(lost.item.is_of_journal()));
+            self.note_incomplete("entries are missing in the log: the disk is too slow for them");
         }
     }
 
@@ -160,6 +162,14 @@ impl LogSender {
     pub(crate) fn count_lost(&self, entries: u64, of_journal: u64) {
         self.0.counters.add(Event::RecordDropped, entries);
         self.0.missing.fetch_add(of_journal, Ordering::Relaxed);
+    }
+
+    /// Records that the log is incomplete.
+    pub(crate) fn note_incomplete(&self, cause: &str) {
+        self.0
+            .counters
+            .troubles()
+            .note(TroubleKind::NotRecorded, cause);
     }
 
     /// Journal entries lost since the last call.

@@ -231,12 +231,14 @@ impl LogWriter {
         } = std::mem::take(&mut self.pending);
         self.recording.count_lost(entries, of_journal);
         self.retry_at = Some(Instant::now() + RETRY_AFTER);
+        let directory = self.config.dir.display();
+        let error = match error {
+            McapError::Io(disk) => disk.to_string(),
+            other => other.to_string(),
+        };
+        self.recording
+            .note_incomplete(&format!("nothing is recorded in {directory}: {error}"));
         if !std::mem::replace(&mut self.failing, true) {
-            let directory = self.config.dir.display();
-            let error = match error {
-                McapError::Io(disk) => disk.to_string(),
-                other => other.to_string(),
-            };
             tracing::warn!(%directory, error, "not recording, the node goes on; trying again every {} s", RETRY_AFTER.as_secs());
         }
     }
@@ -333,6 +335,8 @@ mod tests {
         let all = kept();
         writer(config(1_000_000_000), &counters).write(&entry);
         assert_eq!(counters.events(Event::RecordFailed), 1);
+        let troubles = counters.troubles().present();
+        assert_eq!(troubles[0].kind, "not_recorded", "{troubles:?}");
         assert_eq!(
             kept(),
             all[20..],

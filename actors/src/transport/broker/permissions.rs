@@ -170,12 +170,27 @@ impl Permissions {
     fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
         let (client, topic) = (&session.id.client_id, TopicPlace::of(&publish.topic).1);
         let principal = self.principals.principal(session.id.remote_addr);
-        if principal.is_some_and(|principal| self.door.is_program(&principal, client)) {
-            self.door.note_refusal(client, topic, refusal);
+        if principal
+            .as_ref()
+            .is_some_and(|principal| self.door.is_program(principal, client))
+        {
+            return self.door.note_refusal(client, topic, refusal);
+        }
+        let identity = principal.and_then(|principal| principal.identity);
+        let may_lead = identity.is_some_and(|identity| identity.may_serve());
+        let topic_of_leader = self.policy.topics.parse(topic).is_some_and(|topic| {
+            matches!(
+                topic,
+                Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations
+            )
+        });
+        if may_lead && topic_of_leader {
+            self.principals
+                .count_not_leading(session.id.remote_addr, &self.policy.counters);
         } else {
             self.count_denied(session.id.remote_addr);
-            tracing::debug!(%client, topic, "message refused");
         }
+        tracing::debug!(%client, topic, "message refused");
     }
 
     fn count_denied(&self, address: Option<SocketAddr>) {

@@ -178,6 +178,16 @@ impl PrincipalRegistry {
         );
     }
 
+    /// Counts the refusal of a message that only the leader may publish. At a hand-over, the new
+    /// leader may publish before this node has received that it leads.
+    pub(super) fn count_not_leading(&self, address: Option<SocketAddr>, counters: &Counters) {
+        counters.count(Event::ClientDenied);
+        counters.reject_if_lasting(
+            RejectReason::NotPermitted,
+            self.source(address).as_deref().unwrap_or(OTHERS),
+        );
+    }
+
     /// Records that a connection has started or ended a subscription. A repeated subscription
     /// counts once.
     pub(super) fn note_subscription(

@@ -2,9 +2,10 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
+use ecod::model::time::Timestamp;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::oneshot;
@@ -38,6 +39,10 @@ const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time between two checks whether rmqtt has forwarded enough to accept more.
 const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
 
+/// Time without a byte from a client after which it is cut off rather than slow. Programs send at
+/// least a ping per keep-alive, which is longer: they may be named as cut off, too.
+const CUT_OFF_AFTER: Duration = Duration::from_secs(5);
+
 const BUFFER_BYTES: usize = 8 * 1024;
 
 /// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its
@@ -65,19 +70,22 @@ impl RelayLimits {
         let (slot, cut) = self.backlog.open(principal.quota_key());
         let (from_client, to_client) = tokio::io::split(client);
         let (from_broker, mut to_broker) = broker.into_split();
+        let heard_us = AtomicU64::new(clock::now().micros());
         let up = async {
+            let from_client = (from_client, wire_bytes, &heard_us);
             let forwarded = self
-                .forward_up((from_client, wire_bytes), &mut to_broker, principal, &slot)
+                .forward_up(from_client, &mut to_broker, principal, &slot)
                 .await;
             (forwarded, to_broker.shutdown().await)
         };
+        let to_client = (to_client, &heard_us);
         let down = self.forward_down(from_broker, to_client, principal, &slot, cut);
         tokio::pin!(up, down);
         tokio::select! {
             ended = &mut down => match ended {
                 Err(error) if error.kind() == io::ErrorKind::TimedOut => {
                     // The rest of its queue is dropped.
-                    self.counters.shed(ShedReason::ReaderSlow, principal.source());
+                    self.shed(principal, &heard_us);
                     Err(ClientRejection::Stalled)
                 }
                 _ => Ok(()),
@@ -93,10 +101,22 @@ impl RelayLimits {
         }
     }
 
+    /// Counts a message that a client does not read. One that has sent nothing for long, as a
+    /// connected node does several times a second, is cut off; another one reads too slowly.
+    fn shed(&self, principal: &Principal, heard_us: &AtomicU64) {
+        let heard = Timestamp(heard_us.load(Ordering::Relaxed));
+        if clock::now().since(heard) >= CUT_OFF_AFTER {
+            self.counters.shed_cut_off(principal.source());
+        } else {
+            self.counters
+                .shed(ShedReason::ReaderSlow, principal.source());
+        }
+    }
+
     /// Passes bytes to rmqtt at the principal's rate, and only while rmqtt keeps up.
     async fn forward_up(
         &self,
-        (mut client, wire_bytes): (impl AsyncRead + Unpin, &AtomicUsize),
+        (mut client, wire_bytes, heard_us): (impl AsyncRead + Unpin, &AtomicUsize, &AtomicU64),
         broker: &mut (impl AsyncWrite + Unpin),
         principal: &Principal,
         slot: &BacklogSlot,
@@ -106,6 +126,7 @@ impl RelayLimits {
         let (mut content, mut charged) = (0, 0);
         loop {
             let read = client.read(&mut buffer).await?;
+            heard_us.store(clock::now().micros(), Ordering::Relaxed);
             let received = buffer.get(..read).unwrap_or_default();
             if received.is_empty() {
                 return Ok(());
@@ -154,7 +175,7 @@ impl RelayLimits {
     async fn forward_down(
         &self,
         mut broker: impl AsyncRead + Unpin,
-        mut client: impl AsyncWrite + Unpin,
+        (mut client, heard_us): (impl AsyncWrite + Unpin, &AtomicU64),
         principal: &Principal,
         slot: &BacklogSlot,
         cut: oneshot::Receiver<()>,
@@ -180,7 +201,7 @@ impl RelayLimits {
                     let pushed = queue.push(buffer.get(..read).unwrap_or_default());
                     let Ok(dropped) = pushed else { return Err(stalled()) };
                     for _ in 0..dropped {
-                        self.counters.shed(ShedReason::ReaderSlow, principal.source());
+                        self.shed(principal, heard_us);
                     }
                     slot.set_unread(queue.len(), clock::now());
                 }
@@ -208,4 +229,32 @@ async fn send(client: &mut (impl AsyncWrite + Unpin), bytes: &[u8]) -> io::Resul
 /// The error for a client that does not read its messages, or does not complete its packets.
 fn stalled() -> io::Error {
     io::ErrorKind::TimedOut.into()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+
+    /// A cut network leaves a client that neither reads nor sends; one that is slow still sends.
+    #[test]
+    fn a_client_that_sends_nothing_is_named_as_cut_off_and_another_as_slow() {
+        let principal = Principal::new(None, Ipv4Addr::new(10, 0, 0, 7).into(), false);
+        for (silent, kind) in [(0, "overload"), (6, "network_cut")] {
+            let limits = RelayLimits {
+                backlog: Backlog::new(1 << 20),
+                throttle: ByteThrottle::default(),
+                in_flight: InFlight::default(),
+                elected: Arc::new(|_| false),
+                max_waiting: 4,
+                counters: Arc::default(),
+            };
+            let heard = clock::now() - Duration::from_secs(silent);
+            limits.shed(&principal, &AtomicU64::new(heard.micros()));
+            let troubles = limits.counters.troubles().present();
+            let shown: Vec<_> = troubles.iter().map(|trouble| &*trouble.kind).collect();
+            assert_eq!(shown, [kind], "{silent} s");
+        }
+    }
 }

@@ -47,6 +47,8 @@ pub enum FrameEvent {
     Throttled,
     /// From a node beyond `membership.max_peers`.
     TooManyPeers,
+    /// A request for a renewed certificate that this node refused, as for a revoked one.
+    RenewalRefused,
 }
 
 impl FrameEvent {

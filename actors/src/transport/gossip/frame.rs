@@ -48,6 +48,8 @@ pub(crate) enum FrameKind {
     Gossip = 3,
     /// A datagram of the node's other actors.
     Payload = 4,
+    /// A request for a renewed certificate, or its answer.
+    Renewal = 5,
 }
 
 /// A step of the handshake. In a cell with certificates an
@@ -159,6 +161,7 @@ impl FrameHeader {
             2 => FrameKind::Handshake,
             3 => FrameKind::Gossip,
             4 => FrameKind::Payload,
+            5 => FrameKind::Renewal,
             _ => return Err(FrameEvent::Malformed),
         };
         if [*c0, *c1, *c2, *c3] != cell {

@@ -42,6 +42,13 @@ pub(crate) enum GossipOutput {
     Multicast { frame: Vec<u8> },
     /// Deliver an event.
     Tell(MembershipEvent),
+    /// Answer a message about a renewed certificate.
+    Renewal {
+        from: NodeName,
+        /// The certificate that the sender has proven, in DER.
+        certificate: Arc<[u8]>,
+        body: Vec<u8>,
+    },
 }
 
 /// Arguments of [`GossipMachine::new`].
@@ -79,8 +86,8 @@ pub(crate) struct GossipMachine {
     pending: HashMap<NodeName, PendingFrames>,
     /// Nodes that were only mentioned by other nodes, and the time of the last greeting to them.
     unproven: HashMap<NodeName, Timestamp>,
-    /// The name last reported as taken, and when.
-    taken: Option<(NodeName, Timestamp)>,
+    /// The last claim to a name that another run has.
+    taken: Option<TakenName>,
     /// Time since which all other nodes report that this node's name belongs to another node.
     excluded_since: Option<Timestamp>,
     /// Throttle of reports about other hosts.
@@ -91,6 +98,14 @@ pub(crate) struct GossipMachine {
     rng: ChaCha8Rng,
     outputs: VecDeque<GossipOutput>,
     counters: Arc<FrameCounters>,
+}
+
+/// Two runs that claim one name.
+struct TakenName {
+    name: NodeName,
+    since: Timestamp,
+    last: Timestamp,
+    reported: Timestamp,
 }
 
 struct PendingFrames {
@@ -219,6 +234,15 @@ impl GossipMachine {
     /// Sends a datagram to a node, once. Datagrams are also sent for a while to a node that the
     /// gossip has just declared down.
     pub(crate) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
+        self.send_as(FrameKind::Payload, to, payload, now);
+    }
+
+    /// Sends a message about a renewed certificate, once.
+    pub(crate) fn send_renewal(&mut self, to: &NodeName, body: &[u8], now: Timestamp) {
+        self.send_as(FrameKind::Renewal, to, body, now);
+    }
+
+    fn send_as(&mut self, kind: FrameKind, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
         let address = self
             .gossip
@@ -228,7 +252,7 @@ impl GossipMachine {
             .or_else(|| self.sessions.heard_at(to, at));
         match address {
             Some(address) if !self.left => {
-                self.send_or_queue(to, address, FrameKind::Payload, payload, at);
+                self.send_or_queue(to, address, kind, payload, at);
             }
             _ => self.counters.count(FrameEvent::NoSession),
         }
@@ -313,6 +337,15 @@ impl GossipMachine {
                 };
                 self.outputs.push_back(GossipOutput::Tell(event));
             }
+            FrameContent::Renewal {
+                from,
+                certificate,
+                body,
+            } => self.outputs.push_back(GossipOutput::Renewal {
+                from,
+                certificate,
+                body,
+            }),
             FrameContent::Stranger => self.send_hello(from, true, at),
             FrameContent::NameTaken(name) => self.report_taken(&name, second_run(from), at),
             FrameContent::Namesake { id, answer } => self.meet_namesake(&id, answer, from, at),
@@ -500,11 +533,24 @@ impl GossipMachine {
     }
 
     fn report_taken(&mut self, name: &NodeName, cause: String, at: Timestamp) {
-        let lately = |(last, when): &(NodeName, Timestamp)| {
-            last == name && at.since(*when) < REPORT_INTERVAL
+        let is_going_on =
+            |taken: &TakenName| taken.name == *name && at.since(taken.last) < NAME_PATIENCE;
+        let mut taken = match self.taken.take().filter(is_going_on) {
+            Some(taken) => TakenName { last: at, ..taken },
+            None => TakenName {
+                name: name.clone(),
+                since: at,
+                last: at,
+                reported: Timestamp(0),
+            },
         };
-        if !self.taken.as_ref().is_some_and(lately) {
-            self.taken = Some((name.clone(), at));
+        let is_due =
+            at.since(taken.since) >= TAKEN_TIME && at.since(taken.reported) >= REPORT_INTERVAL;
+        if is_due {
+            taken.reported = at;
+        }
+        self.taken = Some(taken);
+        if is_due {
             let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
             self.outputs
                 .push_back(GossipOutput::Tell(MembershipEvent::Troubled {
@@ -609,6 +655,10 @@ const NAME_PATIENCE: Duration = Duration::from_secs(5);
 /// Burst of reports about other hosts, and time until one more.
 const NOTICE_BURST: u32 = 16;
 const NOTICE_INTERVAL: Duration = Duration::from_millis(250);
+
+/// Time for which two runs must claim a name before it is reported: a node that was killed and
+/// returns at another address has the name of a run that is detected as down a moment later.
+const TAKEN_TIME: Duration = Duration::from_secs(3);
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);

@@ -101,6 +101,12 @@ pub(crate) enum FrameContent {
         rights: Rights,
         body: Vec<u8>,
     },
+    /// A message about a renewed certificate, with the certificate that the sender has proven.
+    Renewal {
+        from: NodeName,
+        certificate: Arc<[u8]>,
+        body: Vec<u8>,
+    },
     /// A frame of a session that is not established, or not any more: greet its sender.
     Stranger,
     /// Two running nodes have this name.
@@ -351,6 +357,14 @@ impl Sessions {
             }
             Some(_) => Err(FrameEvent::Superseded),
             None if kind == FrameKind::Gossip => Ok(FrameContent::Gossip { from, body }),
+            None if kind == FrameKind::Renewal => match &peer.proven {
+                Some(proven) if proven.holder == from => Ok(FrameContent::Renewal {
+                    from,
+                    certificate: Arc::clone(&proven.certificate),
+                    body,
+                }),
+                _ => Err(FrameEvent::Uncertified),
+            },
             None => {
                 let rights = peer
                     .proven

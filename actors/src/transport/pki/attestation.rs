@@ -122,6 +122,17 @@ pub(super) fn signer(key: &PrivateKeyDer<'_>) -> Option<Box<dyn Signer>> {
         .choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])
 }
 
+/// True if a private key belongs to a certificate.
+pub(super) fn is_key_of(key: &PrivateKeyDer<'_>, certificate: &[u8]) -> bool {
+    let (Ok(key), Ok((_, certificate))) =
+        (any_ecdsa_type(key), X509Certificate::from_der(certificate))
+    else {
+        return false;
+    };
+    key.public_key()
+        .is_some_and(|public| certificate.public_key().raw == public.as_ref())
+}
+
 /// True if the owner of a certificate signed a message.
 pub(crate) fn is_signed_by(certificate: &[u8], message: &[u8], signature: &[u8]) -> bool {
     let Ok((_, parsed)) = X509Certificate::from_der(certificate) else {

@@ -2,8 +2,10 @@
 //! to the cell.
 
 mod city;
+mod renewal;
 
 use std::fs::File;
+use std::os::unix::fs::{MetadataExt, lchown};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 use std::{fs, io};
@@ -21,6 +23,8 @@ use serde::{Deserialize, Serialize};
 
 use super::subject::rights_uri;
 use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
+pub use renewal::RenewalRefusal;
+
 use crate::platform::bounded_file;
 use crate::platform::state_file::{content, replace_file, with_checksum};
 
@@ -30,8 +34,8 @@ pub const DEFAULT_DAYS: u32 = 365;
 /// Days for which a CA is valid.
 const CA_DAYS: u32 = 3650;
 
-/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be
-/// behind.
+/// Most time by which the validity of a certificate begins in the past, as clocks of the cell may
+/// be behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
 /// The CA of one cell, or of a city above cells, and its register of certificates.
@@ -179,7 +183,13 @@ impl Authority {
     /// changed it.
     fn lock(&mut self) -> Result<File, AuthorityError> {
         let path = self.directory.join(LOCK);
-        let locked = File::create(&path).and_then(|file| file.lock().map(|()| file));
+        let opened = match File::open(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                File::create(&path).and_then(|file| keep_owner(&path).map(|()| file))
+            }
+            opened => opened,
+        };
+        let locked = opened.and_then(|file| file.lock().map(|()| file));
         let lock = locked.map_err(|source| AuthorityError::File { path, source })?;
         self.register = read_register(&self.directory)?;
         Ok(lock)
@@ -334,6 +344,11 @@ impl Authority {
         Ok(revoked)
     }
 
+    /// True if a directory has the key of a CA.
+    pub(crate) fn has_key(directory: &Path) -> bool {
+        directory.join(CA_KEY).exists()
+    }
+
     /// The CA's certificate.
     pub fn ca(&self) -> PathBuf {
         self.directory.join(CA)
@@ -455,8 +470,13 @@ fn time(timestamp: Timestamp) -> SystemTime {
 }
 
 fn set_validity(parameters: &mut CertificateParams, now: Timestamp, valid: Duration) {
-    parameters.not_before = (time(now) - CLOCK_ALLOWANCE).into();
+    parameters.not_before = (time(now) - clock_allowance(valid)).into();
     parameters.not_after = time(now + valid).into();
+}
+
+/// Time by which a validity begins in the past: a small part of a short one.
+fn clock_allowance(valid: Duration) -> Duration {
+    CLOCK_ALLOWANCE.min(valid / 10)
 }
 
 /// A random serial number of 127 bits, which is positive.
@@ -484,10 +504,22 @@ fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
 }
 
 fn replace(path: &Path, bytes: &[u8], mode: u32) -> Result<(), AuthorityError> {
-    replace_file(path, bytes, mode).map_err(|source| AuthorityError::File {
+    let replaced = replace_file(path, bytes, mode).and_then(|()| keep_owner(path));
+    replaced.map_err(|source| AuthorityError::File {
         path: path.into(),
         source,
     })
+}
+
+/// Gives a new file to the owner of its directory: commands of root and a node that renews
+/// certificates use the same CA.
+fn keep_owner(path: &Path) -> io::Result<()> {
+    let owner = fs::metadata(path.parent().unwrap_or(Path::new(".")))?;
+    let file = fs::symlink_metadata(path)?;
+    if owner.uid() == file.uid() {
+        return Ok(());
+    }
+    lchown(path, Some(owner.uid()), Some(owner.gid()))
 }
 
 #[cfg(test)]

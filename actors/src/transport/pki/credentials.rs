@@ -2,10 +2,12 @@
 
 mod city_trust;
 mod issuers;
+mod replacement;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod::model::names::NodeName;
@@ -23,12 +25,12 @@ use rustls::{ClientConfig, RootCertStore, ServerConfig};
 use tokio::sync::Notify;
 use tokio::time::timeout;
 
-use super::attestation::signer;
+use super::attestation::{is_key_of, signer};
 use super::broker_trust::RecordingVerifier;
-use super::subject::{rights_uri, role_name};
+use super::subject::{Validity, rights_uri, role_name};
 use super::{
-    BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate, MAX_CERTIFICATE_BYTES,
-    TlsConfig,
+    Authority, BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate,
+    MAX_CERTIFICATE_BYTES, TlsConfig,
 };
 use city_trust::CityAuthorities;
 use issuers::{Issuers, ServingNodes};
@@ -42,6 +44,10 @@ pub struct Credentials {
     node: NodeName,
     cache: Mutex<CachedCredentials>,
     changed: Notify,
+    /// The reason why a certificate that ends soon is not renewed yet.
+    unrenewed: Mutex<Option<String>>,
+    /// True while the machine's clock is found to be wrong, by which nothing is renewed.
+    is_clock_wrong: AtomicBool,
 }
 
 #[derive(Debug)]
@@ -56,6 +62,8 @@ struct CachedCredentials {
 pub struct LoadedCredentials {
     /// The node's own certificate.
     pub identity: CertificateSubject,
+    /// Validity of the CA that has issued it.
+    pub(crate) ca_validity: Validity,
     /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A
     /// resumed session would not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
@@ -159,6 +167,8 @@ impl Credentials {
             node: node.clone(),
             cache,
             changed: Notify::new(),
+            unrenewed: Mutex::default(),
+            is_clock_wrong: AtomicBool::new(false),
         })
     }
 
@@ -207,6 +217,39 @@ impl Credentials {
             }
         }
         Arc::clone(&cache.current)
+    }
+
+    /// The reason why a certificate that ends soon is not renewed yet.
+    pub fn unrenewed(&self) -> Option<String> {
+        self.lock_unrenewed().clone()
+    }
+
+    /// Records the reason why a certificate that ends soon is not renewed yet.
+    pub(crate) fn set_unrenewed(&self, reason: Option<String>) {
+        *self.lock_unrenewed() = reason;
+    }
+
+    /// True while the machine's clock is found to be wrong.
+    pub(crate) fn is_clock_wrong(&self) -> bool {
+        self.is_clock_wrong.load(Ordering::Relaxed)
+    }
+
+    /// Records whether the machine's clock is wrong.
+    pub(crate) fn set_clock_wrong(&self, is_wrong: bool) {
+        self.is_clock_wrong.store(is_wrong, Ordering::Relaxed);
+    }
+
+    /// Directory of the cell's CA, if its key is on this machine: `pki` beside `tls.ca`, where
+    /// `ecod-node init` makes it.
+    pub(crate) fn authority(&self) -> Option<PathBuf> {
+        let directory = self.files.ca.parent()?.join("pki");
+        Authority::has_key(&directory).then_some(directory)
+    }
+
+    fn lock_unrenewed(&self) -> MutexGuard<'_, Option<String>> {
+        self.unrenewed
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Waits until the content of the files differs from `known`: half a second at most after the
@@ -282,11 +325,10 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     };
     let issuers = Arc::new(issuers);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
-    let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
-    let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
     let own = certificates
         .first()
         .ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
+    let key = key_of(own, &files.key)?;
     let identity = subject_of(&issuers, own)
         .map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
     if !identity.may_act_as(node.as_str()) {
@@ -334,6 +376,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     client.resumption = Resumption::disabled();
     let (server, client) = (Arc::new(server), Arc::new(client));
     Ok(LoadedCredentials {
+        ca_validity: issuers.validity_of_issuer(own),
         identity,
         server,
         client,
@@ -347,6 +390,20 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         key,
         signer,
     })
+}
+
+/// The private key in a file that belongs to a certificate; the first if none does. There are two
+/// while a certificate is replaced.
+fn key_of(certificate: &[u8], path: &Path) -> Result<PrivateKeyDer<'static>, CredentialsError> {
+    let mut keys: Vec<PrivateKeyDer<'static>> = pem("tls.key", path)?;
+    if keys.is_empty() {
+        return Err(file_error("tls.key", path, "no private key"));
+    }
+    let own = keys
+        .iter()
+        .position(|key| is_key_of(key, certificate))
+        .unwrap_or(0);
+    Ok(keys.swap_remove(own))
 }
 
 /// The node that a certificate names, and its effective rights.

@@ -6,6 +6,8 @@ use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject;
 use x509_parser::certificate::X509Certificate;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::FromDer;
@@ -17,8 +19,14 @@ use super::{BROKER_NAME, OBSERVER_MARK, RIGHTS_SCHEME};
 pub struct CertificateSubject {
     name: NodeName,
     may_serve: bool,
-    begins: Timestamp,
     rights: Rights,
+    validity: Validity,
+}
+
+/// The time in which a certificate is valid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Validity {
+    begins: Timestamp,
     expires: Timestamp,
 }
 
@@ -75,20 +83,22 @@ impl CertificateSubject {
             Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
             None => Rights::ALL,
         };
-        let time =
-            |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
-        let validity = parsed.validity();
-        let (begins, expires) = (
-            time(validity.not_before.timestamp()),
-            time(validity.not_after.timestamp()),
-        );
         Ok(Self {
             name,
             may_serve,
             rights,
-            begins,
-            expires,
+            validity: Validity::read(&parsed),
         })
+    }
+
+    /// Reads a certificate in PEM.
+    ///
+    /// # Errors
+    /// Returns an [`InvalidCertificate`] if it names no node.
+    pub(crate) fn of_pem(certificate: &str) -> Result<Self, InvalidCertificate> {
+        let certificate = CertificateDer::from_pem_slice(certificate.as_bytes())
+            .map_err(|_| InvalidCertificate::Malformed)?;
+        Self::of(&certificate)
     }
 
     /// The node's name.
@@ -103,7 +113,7 @@ impl CertificateSubject {
 
     /// Beginning of the certificate's validity.
     pub fn begins(&self) -> Timestamp {
-        self.begins
+        self.validity.begins
     }
 
     /// Highest role and priority of the node in the election. A certificate of an early version
@@ -134,17 +144,12 @@ impl CertificateSubject {
     /// The remaining validity if the certificate should be replaced: if it ends within 30 days, or
     /// within a third of a shorter validity.
     pub fn due_for_renewal(&self, now: Timestamp) -> Option<Duration> {
-        let validity = self.expires.since(self.begins);
-        let margin = RENEWAL_MARGIN
-            .min(validity / 3)
-            .max(LAST_RENEWAL_MARGIN.min(validity));
-        let left = self.expires.since(now);
-        (left < margin).then_some(left)
+        self.validity.remaining_within(RENEWAL_MARGIN, now)
     }
 
     /// End of the certificate's validity.
     pub fn expires(&self) -> Timestamp {
-        self.expires
+        self.validity.expires
     }
 
     /// True if the node may have a client of this name: its own name, or the name of a part or an
@@ -153,6 +158,38 @@ impl CertificateSubject {
     pub fn may_act_as(&self, name: &str) -> bool {
         name.strip_prefix(self.name.as_str())
             .is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
+    }
+}
+
+impl Validity {
+    /// Of a CA that is unknown.
+    pub(super) const UNLIMITED: Self = Self {
+        begins: Timestamp(0),
+        expires: Timestamp(u64::MAX),
+    };
+
+    /// The validity of a certificate in DER, if it is one.
+    pub(super) fn of(certificate: &[u8]) -> Option<Self> {
+        let (_, parsed) = X509Certificate::from_der(certificate).ok()?;
+        Some(Self::read(&parsed))
+    }
+
+    fn read(certificate: &X509Certificate<'_>) -> Self {
+        let time =
+            |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
+        let validity = certificate.validity();
+        Self {
+            begins: time(validity.not_before.timestamp()),
+            expires: time(validity.not_after.timestamp()),
+        }
+    }
+
+    /// The remaining validity, if it is less than `margin` or than a third of the whole validity.
+    pub(crate) fn remaining_within(self, margin: Duration, now: Timestamp) -> Option<Duration> {
+        let whole = self.expires.since(self.begins);
+        let margin = margin.min(whole / 3).max(LAST_RENEWAL_MARGIN.min(whole));
+        let left = self.expires.since(now);
+        (left < margin).then_some(left)
     }
 }
 

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
+use ecod_actors::messages::newest::ReceivedMap;
 use ecod_actors::transport::pki::Authority;
 use tempfile::TempDir;
 
@@ -50,6 +51,8 @@ pub(crate) struct Cell {
     nodes: BTreeMap<String, Running>,
     feeder: Option<(Feeder, Arc<AtomicI64>)>,
     authority: Option<Authority>,
+    /// Validity of certificates.
+    valid: Duration,
     /// The maps that a node with the right clock took.
     record: Record,
     /// Readiness of each node at each look, with the true time.
@@ -87,6 +90,7 @@ impl Cell {
             nodes: BTreeMap::new(),
             feeder: None,
             authority: None,
+            valid: Duration::from_secs(3600),
             record: Record::default(),
             claims: BTreeMap::new(),
             brokers,
@@ -99,6 +103,34 @@ impl Cell {
         let name = NodeName::from_static("clocks");
         cell.authority = Some(Authority::init(&cell.path("pki"), &name, true_time()).unwrap());
         cell
+    }
+
+    /// A cell whose certificates are short, and renewed by the edge, which has the CA.
+    pub(crate) fn with_renewals(valid: Duration) -> Self {
+        let mut cell = Self::new();
+        let name = NodeName::from_static("clocks");
+        cell.authority = Some(Authority::init(&cell.path("edge/pki"), &name, true_time()).unwrap());
+        cell.valid = valid;
+        cell
+    }
+
+    /// The node's certificate on disk.
+    pub(crate) fn certificate(&self, name: &str) -> PathBuf {
+        self.path(name).join("node.pem")
+    }
+
+    /// Arrival of each map at a node, by the cell's time.
+    pub(crate) fn arrivals(&self, name: &str) -> Vec<Timestamp> {
+        let log = std::fs::read_to_string(self.path(&format!("{name}.maps"))).unwrap_or_default();
+        let maps = log
+            .lines()
+            .map_while(|line| serde_json::from_str::<ReceivedMap>(line).ok());
+        maps.map(|map| map.received_at).collect()
+    }
+
+    /// The log of a node.
+    pub(crate) fn log(&self, name: &str) -> String {
+        std::fs::read_to_string(self.path(&format!("{name}.log"))).unwrap_or_default()
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -155,13 +187,23 @@ impl Cell {
             Role::Auto
         };
         authority
-            .issue(&node, role, Duration::from_secs(3600), true_time())
+            .issue(&node, role, self.valid, true_time())
             .unwrap();
         let (certificate, key) = authority.files_of(&node);
-        format!(
-            "[tls]\nca = {:?}\ncertificate = {certificate:?}\nkey = {key:?}\n",
-            authority.ca()
-        )
+        // Each machine has its own files.
+        let machine = self.directory.path().join(name);
+        std::fs::create_dir_all(&machine).unwrap();
+        let [ca, certificate, key] = [
+            (authority.ca(), "ca.pem"),
+            (certificate, "node.pem"),
+            (key, "node.key"),
+        ]
+        .map(|(from, to)| {
+            let to = machine.join(to);
+            std::fs::copy(from, &to).unwrap();
+            to
+        });
+        format!("[tls]\nca = {ca:?}\ncertificate = {certificate:?}\nkey = {key:?}\n")
     }
 
     fn config(&self, name: &str, page: SocketAddr) -> String {

@@ -156,7 +156,7 @@ impl Cell {
                     GossipOutput::Multicast { frame } if self.multicast => {
                         sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
                     }
-                    GossipOutput::Multicast { .. } => (),
+                    GossipOutput::Multicast { .. } | GossipOutput::Renewal { .. } => (),
                     GossipOutput::Tell(MembershipEvent::Troubled { about, kind, .. }) => {
                         node.troubles.insert((about, kind));
                     }

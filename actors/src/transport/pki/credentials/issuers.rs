@@ -19,6 +19,7 @@ use rustls::{
 };
 
 use super::super::attestation::{is_issued_by, is_list_of};
+use super::super::subject::Validity;
 use super::{CredentialsError, crypto};
 
 /// The CAs of a cell, and the CAs of the city above it. Verifies clients' certificates.
@@ -80,6 +81,16 @@ impl Issuers {
                 .of_cell
                 .iter()
                 .any(|issuer| is_issued_by(&issuer.certificate, certificate))
+    }
+
+    /// Validity of the CA that has issued a certificate; unlimited if it is unknown.
+    pub(super) fn validity_of_issuer(&self, certificate: &[u8]) -> Validity {
+        let issuer = self
+            .all()
+            .find(|issuer| is_issued_by(&issuer.certificate, certificate));
+        issuer
+            .and_then(|issuer| Validity::of(&issuer.certificate))
+            .unwrap_or(Validity::UNLIMITED)
     }
 
     fn all(&self) -> impl Iterator<Item = &Issuer> {
