@@ -754,8 +754,8 @@ fn a_follower_without_rights_that_vouches_for_its_leader_declares_nothing() {
         message,
     });
     let notices = scene.notices();
-    let is_overreach = |notice: &&Notice| matches!(notice, Notice::Overreached { .. });
-    assert!(!notices.iter().any(|notice| is_overreach(&notice)));
+    let is_overreach = |notice: &Notice| matches!(notice, Notice::Overreached { .. });
+    assert!(!notices.iter().any(|notice| is_overreach(notice)));
 }
 
 /// A leader hands leadership over to an `edge`, but not to a node that merely claims that role.
