@@ -149,8 +149,8 @@ impl DetectionRates {
 pub(super) struct LookRates {
     pub(super) object: f64,
     pub(super) clutter: f64,
-    /// True if the vehicle states its field of view: otherwise it may not have looked there.
-    pub(super) is_view_stated: bool,
+    /// True if the vehicle states its pose: otherwise it may not have looked there.
+    pub(super) is_view_known: bool,
 }
 
 impl LookRates {
@@ -233,8 +233,8 @@ pub(super) struct SensorHistory {
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) looks: u32,
-    /// True if the vehicle stated its field of view at the last miss.
-    is_view_stated: bool,
+    /// True if the place was in the vehicle's known field of view at the last miss.
+    is_view_known: bool,
     /// Detections and looks since the last judgement.
     unjudged: ExistenceStatement,
     judged_at: Timestamp,
@@ -262,7 +262,7 @@ impl SensorHistory {
             last_hit: None,
             position: Vector2::zeros(),
             looks: 0,
-            is_view_stated: false,
+            is_view_known: false,
             unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,
@@ -295,7 +295,7 @@ impl SensorHistory {
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
         self.look(at, rates.nats(false));
         self.state = self.state.after(false);
-        self.is_view_stated = rates.is_view_stated;
+        self.is_view_known = rates.is_view_known;
     }
 
     /// Counts a miss as a statement of the vehicle that the place is empty.
@@ -308,6 +308,8 @@ impl SensorHistory {
         let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
+        // That a vehicle never detected the object stays true while it looks.
+        let kept = if self.last_hit.is_none() { 1.0 } else { kept };
         self.sequence = (self.sequence * kept + nats).clamp(-MAX_PEER_NATS, MAX_PEER_NATS);
         self.last_look = self.last_look.max(at);
         self.looks = self.looks.saturating_add(1);
@@ -340,7 +342,7 @@ impl SensorHistory {
 
     /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
-        if self.is_view_stated && self.last_hit.is_none() {
+        if self.is_view_known && self.last_hit.is_none() {
             self.kept(at) * self.sequence
         } else {
             0.0
