@@ -63,6 +63,27 @@ async fn without_the_token_nothing_but_health_is_told() {
     node.stop().await;
 }
 
+/// A form escapes `+` and `/`, which a token in an address may have as they are.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_person_without_the_token_gets_a_form_for_it() {
+    let mut config = config("euclid", Role::Auto, 1);
+    config.dashboard.token = Some(Secret::new("correct+horse/battery"));
+    let (node, page) = start(config).await;
+    let browser = [("Host", "localhost"), ("Accept", "text/html,*/*;q=0.8")];
+    let asked = get_with(page, "/", &browser).await;
+    assert_eq!(asked.status, 401);
+    assert!(asked.body.contains("<input name=\"token\""));
+    let wrong = get_with(page, "/?token=wrong", &browser).await;
+    assert_eq!(wrong.status, 401);
+    assert!(wrong.body.contains("This token is wrong."));
+    for token in ["correct%2Bhorse%2Fbattery", "correct+horse/battery"] {
+        let signed_in = get_with(page, &format!("/?token={token}"), &browser).await;
+        assert_eq!(signed_in.status, 303, "{token}");
+        assert_eq!(signed_in.header("location"), Some("/"));
+    }
+    node.stop().await;
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_page_of_elsewhere_cannot_look_through_a_browser_here() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;

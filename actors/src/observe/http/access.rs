@@ -92,14 +92,22 @@ impl PageAccess {
         if token.is_in_headers(headers) {
             return AccessDecision::Allowed;
         }
-        // The configuration allows no character in a token that an address would escape.
-        match uri.query().and_then(|query| {
+        let as_typed = uri.query().and_then(|query| {
             query
                 .split('&')
                 .find_map(|pair| pair.strip_prefix("token="))
-        }) {
-            Some(given) if token.is(given.as_bytes()) => AccessDecision::SignIn,
-            _ => AccessDecision::Unauthorized,
+        });
+        // A form escapes characters that people may type in an address as they are.
+        let of_form = uri.query().and_then(|query| {
+            form_urlencoded::parse(query.as_bytes())
+                .find_map(|(key, value)| (key == "token").then_some(value))
+        });
+        if as_typed.is_some_and(|given| token.is(given.as_bytes()))
+            || of_form.is_some_and(|given| token.is(given.as_bytes()))
+        {
+            AccessDecision::SignIn
+        } else {
+            AccessDecision::Unauthorized
         }
     }
 

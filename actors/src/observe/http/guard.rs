@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::extract::{Request, State};
-use axum::http::{HeaderValue, StatusCode, header};
+use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
-use axum::response::{IntoResponse, Response};
+use axum::response::{Html, IntoResponse, Response};
 
 use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::connection_limit::ConnectionSlot;
@@ -121,6 +121,10 @@ async fn guard(State(guard): State<Arc<PageGuard>>, request: Request, next: Next
         }
         AccessDecision::Unauthorized => {
             let challenge = [(header::WWW_AUTHENTICATE, "Bearer")];
+            if is_page_of_browser(&request) {
+                let form = Html(sign_in_form(request.uri()));
+                return (StatusCode::UNAUTHORIZED, challenge, form).into_response();
+            }
             let text = "open this page with ?token=… or send Authorization: Bearer …\n";
             (StatusCode::UNAUTHORIZED, challenge, text).into_response()
         }
@@ -130,4 +134,21 @@ async fn guard(State(guard): State<Arc<PageGuard>>, request: Request, next: Next
         )
             .into_response(),
     }
+}
+
+/// True for a person who opens a page; programs and the page's own scripts do not ask for HTML.
+fn is_page_of_browser(request: &Request) -> bool {
+    let accepted = request.headers().get(header::ACCEPT);
+    accepted.is_some_and(|types| types.as_bytes().starts_with(b"text/html"))
+}
+
+/// The form that sends a token to the same address, as `?token=…`.
+fn sign_in_form(uri: &Uri) -> String {
+    let is_answer = uri.query().is_some_and(|query| query.contains("token="));
+    let outcome = if is_answer {
+        "This token is wrong."
+    } else {
+        ""
+    };
+    include_str!("sign_in.html").replace("OUTCOME", outcome)
 }
