@@ -291,7 +291,7 @@ mod tests {
         Renewals::new(Credentials::load(&files, &EUCLID).unwrap().into(), EUCLID)
     }
 
-    fn has_asked(step: Option<RenewalStep>) -> bool {
+    fn has_asked(step: Option<&RenewalStep>) -> bool {
         matches!(
             step,
             Some(RenewalStep::SendToAll(RenewalMessage::Request(_)))
@@ -303,7 +303,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut renewals = renewals(&directory);
         let credentials = Arc::clone(&renewals.credentials);
-        assert!(has_asked(renewals.check(NOW)));
+        assert!(has_asked(renewals.check(NOW).as_ref()));
         let other = credentials.current().certificate().to_vec();
         for message in [
             RenewalMessage::Renewed(vec![0; 100]),
@@ -330,7 +330,7 @@ mod tests {
         assert!(renewals.check(NOW).is_none());
         assert_eq!(credentials.unrenewed().as_deref(), Some(WRONG_CLOCK));
         credentials.set_clock_wrong(false);
-        assert!(has_asked(renewals.check(NOW)));
+        assert!(has_asked(renewals.check(NOW).as_ref()));
         assert_eq!(credentials.unrenewed(), None);
     }
 }
