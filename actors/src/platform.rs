@@ -7,6 +7,7 @@ pub mod content_hash;
 #[cfg(feature = "camera")]
 pub(crate) mod installed;
 pub mod latest_slot;
+pub(crate) mod owner;
 pub mod secret;
 pub mod state_file;
 pub mod state_writer;

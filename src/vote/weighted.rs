@@ -46,7 +46,6 @@ pub(super) struct WeightedVoting {
     free: Vec<usize>,
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
-    /// Votes of other cells, also about vehicles that have not voted yet.
     labels: LabelTable,
     landmarks: LandmarkTable,
     /// Indices of the landmarks to evaluate when the round closes.

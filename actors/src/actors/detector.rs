@@ -122,6 +122,7 @@ impl Actor for Detector {
         } = arguments;
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
+        let skipped_before = counters.events(Event::FrameSkipped);
         let mut pumping = JoinSet::new();
         pumping.spawn(pump(
             capture,
@@ -137,7 +138,7 @@ impl Actor for Detector {
             failing: false,
             max_age,
             slow_frames: 0,
-            skipped_before: 0,
+            skipped_before,
             projector,
             images,
             camera_feed,
@@ -184,7 +185,7 @@ impl Actor for Detector {
         })
         .await?;
         (state.detect, state.images) = (Some(detect), images);
-        state.note_duration(took);
+        state.record_duration(took);
         match outcome {
             Ok(mut detections) => {
                 if std::mem::take(&mut state.failing) {
@@ -220,7 +221,7 @@ impl Actor for Detector {
 
 impl DetectorState {
     /// Records whether the detector is too slow, by the measured time of a frame.
-    fn note_duration(&mut self, took: Duration) {
+    fn record_duration(&mut self, took: Duration) {
         if took < self.max_age {
             self.slow_frames = 0;
             self.skipped_before = self.counters.events(Event::FrameSkipped);

@@ -19,7 +19,7 @@ use ecod::leadership::node::Input;
 use ecod::leadership::round_filter::{AcceptedRound, Refusal, RoundFilter};
 use ecod::leadership::{Leadership, Position};
 use ecod::model::names::NodeName;
-use ecod::wire::{GlobalMap, Reputations, Topic, Verdicts};
+use ecod::wire::{GlobalMap, RejectReason, Reputations, Topic, Verdicts};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
@@ -123,9 +123,13 @@ impl Actor for Follower {
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}
-            Err(Some(reason)) => state
-                .counters
-                .reject(reason, sender.as_ref().map_or(OTHERS, NodeName::as_str)),
+            Err(Some(reason)) => {
+                let sender = sender.as_ref().map_or(OTHERS, NodeName::as_str);
+                match reason {
+                    RejectReason::BadSignature => state.counters.reject_if_lasting(reason, sender),
+                    _ => state.counters.reject(reason, sender),
+                }
+            }
             Err(None) => state.counters.count(Event::Repeated),
         }
         Ok(())

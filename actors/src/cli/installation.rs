@@ -1,7 +1,5 @@
 //! Files of this machine's node, which commands use if they are given no file.
 
-use std::fs;
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
@@ -11,6 +9,7 @@ use serde_json::json;
 use super::Failure;
 use crate::node::config::NodeConfig;
 use crate::node::config::guidance::SERVICE_DIRECTORY;
+use crate::platform::owner::is_root;
 
 /// Flag that names the configuration of a node of this machine.
 #[derive(Debug, Args)]
@@ -40,11 +39,6 @@ const USER_DIRECTORY: &str = "ecod";
 
 /// Directory of a CA that was made by hand.
 pub(super) const AUTHORITY_DIRECTORY: &str = "pki";
-
-/// True if the process has the rights of root.
-pub(super) fn is_root() -> bool {
-    fs::metadata("/proc/self").is_ok_and(|process| process.uid() == 0)
-}
 
 /// Directory in which `init` and `join` make a node.
 pub(super) fn directory() -> &'static Path {

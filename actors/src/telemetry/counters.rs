@@ -192,7 +192,8 @@ impl Counters {
         });
     }
 
-    /// Counts a rejected payload that a change of leader explains, unless it goes on for long.
+    /// Counts a rejected payload that a change of leader, or of the leader's certificate, explains
+    /// unless it goes on for long.
     pub fn reject_if_lasting(&self, reason: RejectReason, source: &str) {
         if self.lasting_rejects.is_flood(reason, source, clock::now()) {
             self.reject(reason, source);
@@ -366,6 +367,16 @@ mod tests {
             .collect();
         assert_eq!(shown, [("message_refused", Some("euclid"))]);
         assert!(!TroubleKind::MessageRefused.refuses_reports());
+    }
+
+    #[test]
+    fn a_refusal_that_a_change_explains_is_counted_and_no_trouble() {
+        let counters = Counters::default();
+        for _ in 0..1000 {
+            counters.reject_if_lasting(RejectReason::BadSignature, "euclid");
+        }
+        assert_eq!(counters.rejects(RejectReason::BadSignature), 1000);
+        assert_eq!(counters.troubles().present(), []);
     }
 
     #[test]

@@ -19,15 +19,31 @@ pub(super) struct Renewals {
     credentials: Arc<Credentials>,
     /// Name of this member: the node's, or an observer's.
     name: NodeName,
-    /// The node's next key, and when a certificate for it was last requested.
-    own: Option<(Arc<NewKey>, Timestamp)>,
-    /// The last request of each node that was answered by a certificate, and that certificate.
-    answered: BTreeMap<NodeName, (Vec<u8>, Vec<u8>)>,
-    requests: KeyedThrottle<NodeName>,
+    /// The renewal of the node's own certificate, while it is due.
+    own: Option<PendingRenewal>,
+    /// The last request of each node that was answered by a certificate.
+    answered: BTreeMap<NodeName, AnsweredRequest>,
+    messages: KeyedThrottle<NodeName>,
     /// Nodes whose requests are being decided.
     in_work: BTreeSet<NodeName>,
     /// True while this node's own files are being replaced.
     is_replacing: bool,
+}
+
+/// A key of this node that has no certificate yet.
+struct PendingRenewal {
+    key: Arc<NewKey>,
+    /// Time of the first request.
+    since: Timestamp,
+    /// Time of the last request.
+    requested_at: Timestamp,
+    /// Why the last answer has not led to a new certificate.
+    refusal: Option<String>,
+}
+
+struct AnsweredRequest {
+    request: Vec<u8>,
+    certificate: Vec<u8>,
 }
 
 /// What follows from a message or from the time.
@@ -46,12 +62,13 @@ const REQUEST_INTERVALS: [Duration; 2] = [Duration::from_secs(2), Duration::from
 /// Part of a certificate's validity between two requests, within these limits.
 const REQUESTS_PER_VALIDITY: u32 = 1000;
 
-/// Time in which a request should be answered.
+/// Time in which a certificate should arrive. Until then a refusal is not shown, because another
+/// node may issue one.
 const ANSWER_TIME: Duration = Duration::from_secs(5);
 
-/// Requests that a node may send at once, and then one per interval.
-const REQUESTS: u32 = 4;
-const REQUEST_INTERVAL: Duration = Duration::from_secs(1);
+/// Messages that a node may send at once, and then one per interval.
+const MESSAGES: u32 = 4;
+const MESSAGE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Nodes whose last answer is stored.
 const MAX_ANSWERED: usize = 1024;
@@ -60,6 +77,7 @@ const MAX_ANSWERED: usize = 1024;
 const MAX_REASON: usize = 120;
 
 const NO_HOLDER: &str = "no node that has the key of the cell's CA answers";
+const WRONG_CLOCK: &str = "this machine's clock is wrong";
 
 impl Renewals {
     pub(super) fn new(credentials: Arc<Credentials>, name: NodeName) -> Self {
@@ -68,7 +86,7 @@ impl Renewals {
             name,
             own: None,
             answered: BTreeMap::new(),
-            requests: KeyedThrottle::new(REQUESTS, REQUEST_INTERVAL),
+            messages: KeyedThrottle::new(MESSAGES, MESSAGE_INTERVAL),
             in_work: BTreeSet::new(),
             is_replacing: false,
         }
@@ -79,35 +97,50 @@ impl Renewals {
     pub(super) fn check(&mut self, now: Timestamp) -> Option<RenewalStep> {
         let current = self.credentials.current();
         let is_due = current.identity.due_for_renewal(clock::wall()).is_some();
-        if !is_due || *current.identity.name() != self.name {
-            if self.own.take().is_some() {
-                self.credentials.set_unrenewed(None);
-            }
+        if *current.identity.name() != self.name {
+            return None;
+        }
+        if !is_due {
+            self.own = None;
+            self.credentials.set_unrenewed(None);
+            return None;
+        }
+        if self.is_replacing {
+            return None;
+        }
+        if self.credentials.is_clock_wrong() {
+            self.own = None;
+            self.credentials.set_unrenewed(Some(WRONG_CLOCK.to_owned()));
             return None;
         }
         let whole = current.identity.expires().since(current.identity.begins());
         let [least, most] = REQUEST_INTERVALS;
         let interval = (whole / REQUESTS_PER_VALIDITY).clamp(least, most);
-        if let Some((_, requested_at)) = &self.own {
-            let waited = now.since(*requested_at);
-            if waited >= ANSWER_TIME && self.credentials.unrenewed().is_none() {
-                self.credentials.set_unrenewed(Some(NO_HOLDER.to_owned()));
+        let request = match &mut self.own {
+            Some(pending) => {
+                if now.since(pending.since) >= ANSWER_TIME {
+                    let reason = pending.refusal.as_deref().unwrap_or(NO_HOLDER);
+                    self.credentials.set_unrenewed(Some(reason.to_owned()));
+                }
+                if now.since(pending.requested_at) < interval {
+                    return None;
+                }
+                pending.requested_at = now;
+                pending.key.request.clone()
             }
-            if waited < interval {
-                return None;
+            none => {
+                let pending = none.insert(PendingRenewal {
+                    key: Arc::new(NewKey::generate().ok()?),
+                    since: now,
+                    requested_at: now,
+                    refusal: None,
+                });
+                self.credentials.set_unrenewed(None);
+                pending.key.request.clone()
             }
-        }
-        if self.is_replacing || self.credentials.is_clock_wrong() {
-            return None;
-        }
-        let key = match self.own.take() {
-            Some((key, _)) => key,
-            None => Arc::new(NewKey::generate().ok()?),
         };
-        self.own = Some((Arc::clone(&key), now));
-        let request = key.request.clone();
         if self.credentials.authority().is_some() {
-            return self.on_request(self.name.clone(), current.certificate(), request, now);
+            return self.on_request(self.name.clone(), current.certificate(), request);
         }
         Some(RenewalStep::SendToAll(RenewalMessage::Request(request)))
     }
@@ -120,11 +153,17 @@ impl Renewals {
         message: RenewalMessage,
         now: Timestamp,
     ) -> Option<RenewalStep> {
+        if !self.messages.allow(&from, now) {
+            return None;
+        }
         match message {
-            RenewalMessage::Request(request) => self.on_request(from, certificate, request, now),
+            RenewalMessage::Request(request) => self.on_request(from, certificate, request),
             RenewalMessage::Renewed(renewed) => {
-                let (key, _) = self.own.as_ref().filter(|_| !self.is_replacing)?;
-                let (key, credentials) = (Arc::clone(key), Arc::clone(&self.credentials));
+                let pending = self.own.as_ref().filter(|_| !self.is_replacing)?;
+                if !pending.key.is_in(&renewed) {
+                    return None;
+                }
+                let (key, credentials) = (Arc::clone(&pending.key), Arc::clone(&self.credentials));
                 self.is_replacing = true;
                 Some(RenewalStep::Work(Box::new(move || {
                     let installed = key.install(&renewed, &credentials);
@@ -132,10 +171,9 @@ impl Renewals {
                 })))
             }
             RenewalMessage::Refused(mut reason) => {
-                if self.own.is_some() {
+                if let Some(pending) = &mut self.own {
                     reason.truncate(reason.floor_char_boundary(MAX_REASON));
-                    self.credentials
-                        .set_unrenewed(Some(format!("{from} does not renew it: {reason}")));
+                    pending.refusal = Some(format!("{from} does not renew it: {reason}"));
                 }
                 None
             }
@@ -147,16 +185,15 @@ impl Renewals {
         from: NodeName,
         certificate: &[u8],
         request: Vec<u8>,
-        now: Timestamp,
     ) -> Option<RenewalStep> {
         let is_node = *self.credentials.current().identity.name() == self.name;
         let directory = self.credentials.authority().filter(|_| is_node)?;
-        if !self.requests.allow(&from, now) || self.credentials.is_clock_wrong() {
+        if self.credentials.is_clock_wrong() {
             return None;
         }
         match self.answered.get(&from) {
-            Some((before, renewed)) if *before == request => {
-                let again = RenewalMessage::Renewed(renewed.clone());
+            Some(before) if before.request == request => {
+                let again = RenewalMessage::Renewed(before.certificate.clone());
                 return Some(RenewalStep::Send(from, again));
             }
             _ => {}
@@ -191,7 +228,11 @@ impl Renewals {
                 if self.answered.len() >= MAX_ANSWERED {
                     self.answered.clear();
                 }
-                self.answered.insert(to.clone(), (request, renewed.clone()));
+                let answered = AnsweredRequest {
+                    request,
+                    certificate: renewed.clone(),
+                };
+                self.answered.insert(to.clone(), answered);
                 Some(RenewalStep::Send(to, RenewalMessage::Renewed(renewed)))
             }
             RenewalOutcome::Answered {
@@ -210,9 +251,86 @@ impl Renewals {
             }
             RenewalOutcome::Replaced(Err(reason)) => {
                 tracing::debug!(reason, "this node's certificate was not renewed");
-                self.credentials.set_unrenewed(Some(reason));
+                if let Some(pending) = &mut self.own {
+                    pending.refusal = Some(reason);
+                }
                 None
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::Role;
+
+    use super::*;
+    use crate::transport::pki::{Authority, TlsConfig};
+
+    const DAY: Duration = Duration::from_secs(86_400);
+    const EUCLID: NodeName = NodeName::from_static("euclid");
+    const GAUSS: NodeName = NodeName::from_static("gauss");
+    const NOW: Timestamp = Timestamp(1_000_000_000);
+
+    /// The renewals of `euclid`, whose certificate has one day left, in a directory without the
+    /// key of the CA.
+    fn renewals(directory: &tempfile::TempDir) -> Renewals {
+        let (now, cell) = (clock::wall(), NodeName::from_static("lot"));
+        let mut authority = Authority::init(directory.path(), &cell, now).unwrap();
+        authority
+            .issue(&EUCLID, Role::Auto, 10 * DAY, now - 9 * DAY)
+            .unwrap();
+        let (certificate, key) = authority.files_of(&EUCLID);
+        let files = TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: None,
+            city: None,
+        };
+        Renewals::new(Credentials::load(&files, &EUCLID).unwrap().into(), EUCLID)
+    }
+
+    fn has_asked(step: Option<&RenewalStep>) -> bool {
+        matches!(
+            step,
+            Some(RenewalStep::SendToAll(RenewalMessage::Request(_)))
+        )
+    }
+
+    #[test]
+    fn junk_starts_no_work_and_a_refusal_is_shown_when_no_certificate_comes() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut renewals = renewals(&directory);
+        let credentials = Arc::clone(&renewals.credentials);
+        assert!(has_asked(renewals.check(NOW).as_ref()));
+        let other = credentials.current().certificate().to_vec();
+        for message in [
+            RenewalMessage::Renewed(vec![0; 100]),
+            RenewalMessage::Renewed(other),
+            RenewalMessage::Refused("it was revoked".into()),
+        ] {
+            assert!(renewals.on_message(GAUSS, &[], message, NOW).is_none());
+        }
+        _ = renewals.check(NOW + Duration::from_secs(1));
+        assert_eq!(credentials.unrenewed(), None);
+        _ = renewals.check(NOW + ANSWER_TIME);
+        assert_eq!(
+            credentials.unrenewed().as_deref(),
+            Some("gauss does not renew it: it was revoked")
+        );
+    }
+
+    #[test]
+    fn a_wrong_clock_is_named_until_it_is_right() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut renewals = renewals(&directory);
+        let credentials = Arc::clone(&renewals.credentials);
+        credentials.set_clock_wrong(true);
+        assert!(renewals.check(NOW).is_none());
+        assert_eq!(credentials.unrenewed().as_deref(), Some(WRONG_CLOCK));
+        credentials.set_clock_wrong(false);
+        assert!(has_asked(renewals.check(NOW).as_ref()));
+        assert_eq!(credentials.unrenewed(), None);
     }
 }

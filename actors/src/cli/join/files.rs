@@ -15,6 +15,7 @@ use crate::cli::installation;
 use crate::node::config::guidance::SERVICE_DIRECTORY;
 use crate::node::config::{END_OF_CONFIGURATION, NodeConfig};
 use crate::platform::bounded_file;
+use crate::platform::owner::is_root;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
 use crate::transport::pki::{CertificateSubject, CityTlsConfig, Credentials, TlsConfig};
@@ -61,7 +62,7 @@ impl NodeDirectory {
         let path = made
             .and_then(|()| path.canonicalize())
             .with_context(|| format!("cannot use {}", path.display()))?;
-        let is_service = installation::is_root() && path == Path::new(SERVICE_DIRECTORY);
+        let is_service = is_root() && path == Path::new(SERVICE_DIRECTORY);
         Ok(Self {
             path,
             state_of_service: is_service.then(|| STATE_DIRECTORY.into()),

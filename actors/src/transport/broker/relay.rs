@@ -39,8 +39,13 @@ const FAREWELL_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time between two checks whether rmqtt has forwarded enough to accept more.
 const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
 
-/// Time without a byte from a client after which it is cut off rather than slow. Programs send at
-/// least a ping per keep-alive, which is longer: they may be named as cut off, too.
+/// When bytes last passed between a client and its relay.
+struct Activity {
+    received_us: AtomicU64,
+    sent_us: AtomicU64,
+}
+
+/// Time without a byte from or to a client after which it is cut off rather than slow.
 const CUT_OFF_AFTER: Duration = Duration::from_secs(5);
 
 const BUFFER_BYTES: usize = 8 * 1024;
@@ -52,6 +57,14 @@ const MAX_FILTERS_BYTES: usize = MAX_SUBSCRIPTIONS * 256;
 /// Packet types, in the upper half of the first byte.
 const SUBSCRIBE: u8 = 8;
 const UNSUBSCRIBE: u8 = 10;
+
+/// What both directions of a relay use.
+#[derive(Clone, Copy)]
+struct ClientSide<'a> {
+    principal: &'a Principal,
+    slot: &'a BacklogSlot,
+    activity: &'a Activity,
+}
 
 impl RelayLimits {
     /// Forwards bytes until either side ends or the client exceeds its limits. `wire_bytes` counts
@@ -70,22 +83,25 @@ impl RelayLimits {
         let (slot, cut) = self.backlog.open(principal.quota_key());
         let (from_client, to_client) = tokio::io::split(client);
         let (from_broker, mut to_broker) = broker.into_split();
-        let heard_us = AtomicU64::new(clock::now().micros());
+        let activity = Activity::new(clock::now());
+        let client = ClientSide {
+            principal,
+            slot: &slot,
+            activity: &activity,
+        };
         let up = async {
-            let from_client = (from_client, wire_bytes, &heard_us);
             let forwarded = self
-                .forward_up(from_client, &mut to_broker, principal, &slot)
+                .forward_up(from_client, wire_bytes, &mut to_broker, client)
                 .await;
             (forwarded, to_broker.shutdown().await)
         };
-        let to_client = (to_client, &heard_us);
-        let down = self.forward_down(from_broker, to_client, principal, &slot, cut);
+        let down = self.forward_down(from_broker, to_client, client, cut);
         tokio::pin!(up, down);
         tokio::select! {
             ended = &mut down => match ended {
                 Err(error) if error.kind() == io::ErrorKind::TimedOut => {
                     // The rest of its queue is dropped.
-                    self.shed(principal, &heard_us);
+                    self.shed(principal, &activity);
                     Err(ClientRejection::Stalled)
                 }
                 _ => Ok(()),
@@ -101,11 +117,10 @@ impl RelayLimits {
         }
     }
 
-    /// Counts a message that a client does not read. One that has sent nothing for long, as a
-    /// connected node does several times a second, is cut off; another one reads too slowly.
-    fn shed(&self, principal: &Principal, heard_us: &AtomicU64) {
-        let heard = Timestamp(heard_us.load(Ordering::Relaxed));
-        if clock::now().since(heard) >= CUT_OFF_AFTER {
+    /// Counts a message that a client does not read. One that has neither read nor sent for long is
+    /// cut off; another one reads too slowly.
+    fn shed(&self, principal: &Principal, activity: &Activity) {
+        if clock::now().since(activity.last()) >= CUT_OFF_AFTER {
             self.counters.shed_cut_off(principal.source());
         } else {
             self.counters
@@ -116,17 +131,22 @@ impl RelayLimits {
     /// Passes bytes to rmqtt at the principal's rate, and only while rmqtt keeps up.
     async fn forward_up(
         &self,
-        (mut client, wire_bytes, heard_us): (impl AsyncRead + Unpin, &AtomicUsize, &AtomicU64),
+        mut from_client: impl AsyncRead + Unpin,
+        wire_bytes: &AtomicUsize,
         broker: &mut (impl AsyncWrite + Unpin),
-        principal: &Principal,
-        slot: &BacklogSlot,
+        client: ClientSide<'_>,
     ) -> io::Result<()> {
+        let ClientSide {
+            principal,
+            slot,
+            activity,
+        } = client;
         let (mut buffer, mut scanner, mut unfinished) =
             (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
         let (mut content, mut charged) = (0, 0);
         loop {
-            let read = client.read(&mut buffer).await?;
-            heard_us.store(clock::now().micros(), Ordering::Relaxed);
+            let read = from_client.read(&mut buffer).await?;
+            store(&activity.received_us, clock::now());
             let received = buffer.get(..read).unwrap_or_default();
             if received.is_empty() {
                 return Ok(());
@@ -175,24 +195,32 @@ impl RelayLimits {
     async fn forward_down(
         &self,
         mut broker: impl AsyncRead + Unpin,
-        (mut client, heard_us): (impl AsyncWrite + Unpin, &AtomicU64),
-        principal: &Principal,
-        slot: &BacklogSlot,
+        mut to_client: impl AsyncWrite + Unpin,
+        client: ClientSide<'_>,
         cut: oneshot::Receiver<()>,
     ) -> io::Result<()> {
+        let ClientSide {
+            principal,
+            slot,
+            activity,
+        } = client;
         let (mut buffer, mut queue) = (vec![0; BUFFER_BYTES], OutboundQueue::new(self.max_waiting));
         let (mut is_flushed, mut has_ended) = (true, false);
         tokio::pin!(cut);
         loop {
             if has_ended && queue.is_empty() && is_flushed {
-                return client.shutdown().await;
+                return to_client.shutdown().await;
             }
             tokio::select! {
                 biased;
                 _ = &mut cut => return Err(stalled()),
-                sent = send(&mut client, queue.next()), if !queue.is_empty() || !is_flushed => {
+                sent = send(&mut to_client, queue.next()), if !queue.is_empty() || !is_flushed => {
                     is_flushed = queue.is_empty();
-                    queue.advance(sent?);
+                    let sent = sent?;
+                    if sent > 0 {
+                        store(&activity.sent_us, clock::now());
+                    }
+                    queue.advance(sent);
                     slot.set_unread(queue.len(), clock::now());
                 }
                 read = broker.read(&mut buffer), if !has_ended => {
@@ -201,13 +229,33 @@ impl RelayLimits {
                     let pushed = queue.push(buffer.get(..read).unwrap_or_default());
                     let Ok(dropped) = pushed else { return Err(stalled()) };
                     for _ in 0..dropped {
-                        self.shed(principal, heard_us);
+                        self.shed(principal, activity);
                     }
                     slot.set_unread(queue.len(), clock::now());
                 }
             }
         }
     }
+}
+
+impl Activity {
+    fn new(now: Timestamp) -> Self {
+        Self {
+            received_us: AtomicU64::new(now.micros()),
+            sent_us: AtomicU64::new(now.micros()),
+        }
+    }
+
+    /// Time of the last byte from or to the client.
+    fn last(&self) -> Timestamp {
+        let [received, sent] =
+            [&self.received_us, &self.sent_us].map(|time| Timestamp(time.load(Ordering::Relaxed)));
+        received.max(sent)
+    }
+}
+
+fn store(time: &AtomicU64, now: Timestamp) {
+    time.store(now.micros(), Ordering::Relaxed);
 }
 
 fn has_too_many_filters(header: &[u8], length: usize) -> bool {
@@ -237,11 +285,16 @@ mod tests {
 
     use super::*;
 
-    /// A cut network leaves a client that neither reads nor sends; one that is slow still sends.
+    /// A cut network leaves a client that neither reads nor sends; one that is slow does either.
     #[test]
-    fn a_client_that_sends_nothing_is_named_as_cut_off_and_another_as_slow() {
+    fn a_client_that_neither_reads_nor_sends_is_named_as_cut_off_and_another_as_slow() {
         let principal = Principal::new(None, Ipv4Addr::new(10, 0, 0, 7).into(), false);
-        for (silent, kind) in [(0, "overload"), (6, "network_cut")] {
+        for (received, sent, kind) in [
+            (0, 0, "overload"),
+            (6, 0, "overload"),
+            (0, 6, "overload"),
+            (6, 6, "network_cut"),
+        ] {
             let limits = RelayLimits {
                 backlog: Backlog::new(1 << 20),
                 throttle: ByteThrottle::default(),
@@ -250,11 +303,16 @@ mod tests {
                 max_waiting: 4,
                 counters: Arc::default(),
             };
-            let heard = clock::now() - Duration::from_secs(silent);
-            limits.shed(&principal, &AtomicU64::new(heard.micros()));
+            let ago =
+                |seconds| AtomicU64::new((clock::now() - Duration::from_secs(seconds)).micros());
+            let activity = Activity {
+                received_us: ago(received),
+                sent_us: ago(sent),
+            };
+            limits.shed(&principal, &activity);
             let troubles = limits.counters.troubles().present();
             let shown: Vec<_> = troubles.iter().map(|trouble| &*trouble.kind).collect();
-            assert_eq!(shown, [kind], "{silent} s");
+            assert_eq!(shown, [kind], "{received} s, {sent} s");
         }
     }
 }

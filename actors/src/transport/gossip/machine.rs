@@ -8,7 +8,7 @@
 //! each call, [`GossipMachine::poll`] until it returns `None`. A caller that was stalled passes all
 //! waiting datagrams before it ticks; the time of the stall does not count.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -86,8 +86,8 @@ pub(crate) struct GossipMachine {
     pending: HashMap<NodeName, PendingFrames>,
     /// Nodes that were only mentioned by other nodes, and the time of the last greeting to them.
     unproven: HashMap<NodeName, Timestamp>,
-    /// The last claim to a name that another run has.
-    taken: Option<TakenName>,
+    /// Names that a second run claims, up to [`MAX_TAKEN`].
+    taken: BTreeMap<NodeName, TakenName>,
     /// Time since which all other nodes report that this node's name belongs to another node.
     excluded_since: Option<Timestamp>,
     /// Throttle of reports about other hosts.
@@ -102,7 +102,6 @@ pub(crate) struct GossipMachine {
 
 /// Two runs that claim one name.
 struct TakenName {
-    name: NodeName,
     since: Timestamp,
     last: Timestamp,
     reported: Timestamp,
@@ -148,7 +147,7 @@ impl GossipMachine {
             seeds: Vec::new(),
             pending: HashMap::new(),
             unproven: HashMap::new(),
-            taken: None,
+            taken: BTreeMap::new(),
             excluded_since: None,
             notices: TokenBucket::new(NOTICE_BURST, NOTICE_INTERVAL, now),
             left: false,
@@ -533,24 +532,21 @@ impl GossipMachine {
     }
 
     fn report_taken(&mut self, name: &NodeName, cause: String, at: Timestamp) {
-        let is_going_on =
-            |taken: &TakenName| taken.name == *name && at.since(taken.last) < NAME_PATIENCE;
-        let mut taken = match self.taken.take().filter(is_going_on) {
-            Some(taken) => TakenName { last: at, ..taken },
-            None => TakenName {
-                name: name.clone(),
-                since: at,
-                last: at,
-                reported: Timestamp(0),
-            },
-        };
+        self.taken
+            .retain(|_, taken| at.since(taken.last) < NAME_PATIENCE);
+        if self.taken.len() >= MAX_TAKEN && !self.taken.contains_key(name) {
+            return;
+        }
+        let taken = self.taken.entry(name.clone()).or_insert(TakenName {
+            since: at,
+            last: at,
+            reported: Timestamp(0),
+        });
+        taken.last = at;
         let is_due =
             at.since(taken.since) >= TAKEN_TIME && at.since(taken.reported) >= REPORT_INTERVAL;
         if is_due {
             taken.reported = at;
-        }
-        self.taken = Some(taken);
-        if is_due {
             let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
             self.outputs
                 .push_back(GossipOutput::Tell(MembershipEvent::Troubled {
@@ -659,6 +655,9 @@ const NOTICE_INTERVAL: Duration = Duration::from_millis(250);
 /// Time for which two runs must claim a name before it is reported: a node that was killed and
 /// returns at another address has the name of a run that is detected as down a moment later.
 const TAKEN_TIME: Duration = Duration::from_secs(3);
+
+/// Most names that are observed at once.
+const MAX_TAKEN: usize = 8;
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(1);

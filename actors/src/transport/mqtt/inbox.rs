@@ -142,10 +142,7 @@ impl Inbox {
                 .ok_or(RejectReason::BadSignature)?,
             _ => payload,
         };
-        let origin = |aggregator| {
-            self.origin(via, aggregator, topic, payload)
-                .ok_or(RejectReason::BadSignature)
-        };
+        let origin = |aggregator| self.origin(via, aggregator, topic, payload);
         let (message, origin) = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
             Topic::Detections(node) => {
                 return self.read_report(via, ReportKind::Detections, &node, payload, received_at);
@@ -184,7 +181,9 @@ impl Inbox {
                     return Ok(self.echo());
                 }
                 self.check_date(map.fused_at_us, received_at)?;
-                let origin = origin(Some(&map.aggregator))?;
+                let Some(origin) = origin(Some(&map.aggregator)) else {
+                    return Ok(self.refuse_unproven(via, topic));
+                };
                 (Incoming::Map(Arc::new(map)), origin)
             }
             Topic::GlobalVerdicts => {
@@ -194,7 +193,9 @@ impl Inbox {
                     return Ok(self.echo());
                 }
                 self.check_date(verdicts.fused_at_us, received_at)?;
-                let origin = origin(Some(&verdicts.aggregator))?;
+                let Some(origin) = origin(Some(&verdicts.aggregator)) else {
+                    return Ok(self.refuse_unproven(via, topic));
+                };
                 (Incoming::Verdicts(Arc::new(verdicts)), origin)
             }
             Topic::Cell | Topic::Reputations if payload.is_empty() => {
@@ -212,7 +213,9 @@ impl Inbox {
                 if reputations.aggregator.as_ref() == Some(&self.node) {
                     return Ok(self.echo());
                 }
-                let origin = origin(reputations.aggregator.as_ref())?;
+                let Some(origin) = origin(reputations.aggregator.as_ref()) else {
+                    return Ok(self.refuse_unproven(via, topic));
+                };
                 (Incoming::Reputations(Arc::new(reputations)), origin)
             }
         };
@@ -254,6 +257,15 @@ impl Inbox {
         Origin::of(aggregator, via.node, || {
             self.security.check_round(aggregator, topic, payload)
         })
+    }
+
+    /// Counts a round that its aggregator has not proven. A leader that restarts, or has a new
+    /// certificate, may publish before this node has received that certificate.
+    fn refuse_unproven(&self, via: Via<'_>, topic: &[u8]) -> PacketOutcome {
+        self.counters
+            .reject_if_lasting(RejectReason::BadSignature, &self.source(via, topic));
+        tracing::debug!(topic = %topic.escape_ascii(), "round not proven");
+        PacketOutcome::Done
     }
 
     /// Checks that a round is not from the far future, as far as this node has a time estimate.

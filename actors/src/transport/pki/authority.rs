@@ -5,7 +5,7 @@ mod city;
 mod renewal;
 
 use std::fs::File;
-use std::os::unix::fs::{MetadataExt, lchown};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 use std::{fs, io};
@@ -26,6 +26,7 @@ use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
 pub use renewal::RenewalRefusal;
 
 use crate::platform::bounded_file;
+use crate::platform::owner::give;
 use crate::platform::state_file::{content, replace_file, with_checksum};
 
 /// Default validity of a node's certificate in days.
@@ -519,7 +520,7 @@ fn keep_owner(path: &Path) -> io::Result<()> {
     if owner.uid() == file.uid() {
         return Ok(());
     }
-    lchown(path, Some(owner.uid()), Some(owner.gid()))
+    give(path, &owner)
 }
 
 #[cfg(test)]

@@ -18,6 +18,8 @@ use rcgen::{CertificateParams, CertificateSigningRequestParams, KeyPair};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateSigningRequestDer};
 use serde::{Deserialize, Serialize};
+use x509_parser::certificate::X509Certificate;
+use x509_parser::prelude::FromDer;
 
 use super::{Authority, Credentials, CredentialsError};
 use crate::platform::clock;
@@ -47,6 +49,13 @@ impl NewKey {
         let request = CertificateParams::default().serialize_request(&key)?;
         let request = request.der().to_vec();
         Ok(Self { key, request })
+    }
+
+    /// True if a certificate in DER is for this key.
+    pub(crate) fn is_in(&self, certificate: &[u8]) -> bool {
+        X509Certificate::from_der(certificate).is_ok_and(|(_, certificate)| {
+            *certificate.public_key().subject_public_key.data == *self.key.public_key_raw()
+        })
     }
 
     /// Replaces the node's certificate and key by a new certificate and this key.

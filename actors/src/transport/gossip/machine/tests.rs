@@ -435,6 +435,23 @@ fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up
     );
 }
 
+#[test]
+fn two_taken_names_are_reported_beside_each_other() {
+    let mut cell = Cell::of(4);
+    cell.start(9, "node-2");
+    cell.start(10, "node-3");
+    cell.run(8000);
+    for node in [1, 4] {
+        let troubles = &cell.nodes[&node].troubles;
+        for name in ["node-2", "node-3"] {
+            assert!(
+                troubles.contains(&(name.into(), TroubleKind::NameTaken)),
+                "{node} reports {name}: {troubles:?}"
+            );
+        }
+    }
+}
+
 /// Asserts that node 9 has given up the name of node 1, that only node 9 was informed, and that
 /// node 1 has reported it.
 fn assert_second_gave_up(cell: &Cell) {

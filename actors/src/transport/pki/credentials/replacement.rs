@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io;
-use std::os::unix::fs::{MetadataExt, PermissionsExt, lchown};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
 use base64::Engine;
@@ -13,6 +13,7 @@ use x509_parser::prelude::FromDer;
 
 use super::{Credentials, CredentialsError, file_error};
 use crate::platform::bounded_file;
+use crate::platform::owner::give;
 use crate::platform::state_file::replace_file;
 
 impl Credentials {
@@ -63,7 +64,7 @@ fn replace_like_before(path: &Path, text: &str) -> io::Result<()> {
     if fs::symlink_metadata(path)?.uid() == former.uid() {
         return Ok(());
     }
-    lchown(path, Some(former.uid()), Some(former.gid()))
+    give(path, &former)
 }
 
 /// A certificate in PEM.
