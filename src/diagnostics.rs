@@ -103,7 +103,7 @@ trouble_kinds! {
     NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
     /// More messages than are accepted.
     Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`; for more vehicles `fusion.window.max_vehicles`";
-    /// A client of this node's broker that neither reads nor sends.
+    /// The connection of a client to this node's broker stands still in both directions.
     NetworkCut = "network_cut", LONG, "look at the network between both, and whether its machine runs";
     /// A node of this cell with another key.
     WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";

@@ -5,7 +5,6 @@ use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
-use ecod_actors::transport::pki::{Authority, TlsConfig};
 
 /// Any free port of loopback.
 pub fn loopback() -> SocketAddr {
@@ -47,16 +46,4 @@ pub fn node_config(node: &str, cell: &str, role: Role) -> NodeConfig {
 pub fn greet(config: &mut NodeConfig, seed: SocketAddr, is_seed: bool) {
     config.membership.bind = Some(if is_seed { seed } else { loopback() });
     config.membership.seeds = vec![seed.to_string()];
-}
-
-/// The files of a node's certificate, in a cell without a city.
-pub fn tls_files(authority: &Authority, node: &NodeName) -> TlsConfig {
-    let (certificate, key) = authority.files_of(node);
-    TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
-        revocation_list: Some(authority.revocation_list()),
-        city: None,
-    }
 }

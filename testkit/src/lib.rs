@@ -13,7 +13,7 @@ mod wait;
 
 pub use camera::car_ahead;
 pub use cell::Cell;
-pub use config::{free_gossip_address, greet, loopback, name, node_config, tls_files};
+pub use config::{free_gossip_address, greet, loopback, name, node_config};
 pub use help::help_of;
 pub use member::{Member, member_config};
 pub use program::{command, output_of};

@@ -257,14 +257,10 @@ pub(super) fn role_named(name: &str) -> Role {
 
 /// Section of the node's configuration that names these files.
 fn configuration(authority: &Authority, node: &NodeName) -> String {
-    let (certificate, key) = authority.files_of(node);
-    let [ca, certificate, key, list] = [
-        authority.ca(),
-        certificate,
-        key,
-        authority.revocation_list(),
-    ]
-    .map(|path| shown(&path));
+    let files = authority.tls_of(node);
+    let [ca, certificate, key] =
+        [&files.ca, &files.certificate, &files.key].map(|path| shown(path));
+    let list = shown(&authority.revocation_list());
     format!(
         "[tls]\nca = \"{ca}\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\nrevocation_list = \"{list}\"\n"
     )

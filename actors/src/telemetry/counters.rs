@@ -262,13 +262,13 @@ impl Counters {
         );
     }
 
-    /// Counts a message for a client of the broker that neither reads nor sends.
+    /// Counts a message for a client of the broker whose connection stands still in both directions.
     pub fn shed_cut_off(&self, source: &str) {
         self.shed.count(ShedReason::ReaderSlow, source);
         self.troubles.note_about(
             source,
             TroubleKind::NetworkCut,
-            "neither reads nor sends: the network to it is cut, or its machine stands still",
+            "its connection stands still in both directions: the network is cut, or its machine has stopped",
         );
     }
 

@@ -12,7 +12,7 @@ use ecod_actors::observe::recorder::RecordConfig;
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Counters;
 use ecod_actors::transport::pki::{Authority, Credentials};
-use ecod_testkit::{Cell, PATIENCE, car_ahead, node_config, tls_files};
+use ecod_testkit::{Cell, PATIENCE, car_ahead, node_config};
 use rumqttc::{AsyncClient, MqttOptions, QoS, TlsConfiguration, Transport};
 use tokio::task::{JoinHandle, JoinSet};
 use tokio::time::{Instant, sleep};
@@ -38,7 +38,7 @@ fn configure(node: &str, role: Role, directory: &Path) -> NodeConfig {
         .or_else(|_| Authority::init(&pki, &NodeName::from_static("lot"), clock::wall()))
         .unwrap();
     authority.issue(&name, role, DAY, clock::wall()).unwrap();
-    config.tls = Some(tls_files(&authority, &name));
+    config.tls = Some(authority.tls_of(&name));
     config.state_dir = Some(directory.join(node));
     if node == "gauss" {
         config.camera = Some(toml::from_str(&car_ahead(directory)).unwrap());

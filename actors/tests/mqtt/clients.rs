@@ -14,7 +14,7 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
-use ecod_testkit::{node_config, tls_files};
+use ecod_testkit::node_config;
 
 /// An edge of the cell that the documentation speaks of.
 async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
@@ -148,7 +148,7 @@ async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
         .unwrap();
     let tls = TlsConfig {
         revocation_list: None,
-        ..tls_files(&authority, &name)
+        ..authority.tls_of(&name)
     };
     std::fs::copy(&tls.certificate, directory.path().join("node.pem")).unwrap();
     std::fs::copy(&tls.key, directory.path().join("node.key")).unwrap();

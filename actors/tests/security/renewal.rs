@@ -108,7 +108,7 @@ async fn a_revoked_certificate_is_not_renewed_and_its_node_says_why() {
     let mut machines = Machines::new();
     let edge_files = machines.files("edge", Role::Edge, 0);
     let files = machines.files("gauss", Role::Cav, 65);
-    // Nodes have the list of before: the CA alone knows.
+    // Nodes still have the former list: only the CA has the revocation.
     machines
         .authority
         .revoke(&name("gauss"), clock::now())
@@ -134,14 +134,7 @@ async fn every_node_warns_of_the_end_of_the_cells_ca() {
     authority
         .issue(&name("edge"), Role::Edge, 90 * DAY, clock::now())
         .unwrap();
-    let (certificate, key) = authority.files_of(&name("edge"));
-    let files = TlsConfig {
-        ca: authority.ca(),
-        certificate,
-        key,
-        revocation_list: None,
-        city: None,
-    };
+    let files = authority.tls_of(&name("edge"));
     let edge = start("edge", Role::Edge, files, None).await;
     let warns = || {
         let troubles = edge.counters().troubles().present();

@@ -20,7 +20,7 @@ use ecod_client::{
     BoxCamera, BoxFrame, Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, Mount,
     NodeName, NodeState, PerceivedObject, PixelBox, Pose, Role, Settings, Timestamp, Tls, WirePose,
 };
-use ecod_testkit::{loopback, node_config, tls_files};
+use ecod_testkit::{loopback, node_config};
 use rumqttc::{Client, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
@@ -209,7 +209,7 @@ fn tls_of(authority: &mut Authority, name: &'static str, role: Role) -> (TlsConf
         .unwrap();
     let files = TlsConfig {
         revocation_list: None,
-        ..tls_files(authority, &name)
+        ..authority.tls_of(&name)
     };
     let tls = Tls::of_door(files.ca.clone(), &files.certificate, &files.key);
     (files, tls)

@@ -17,7 +17,7 @@ use ecod_client::{
 };
 use ecod_interop::bridge::{CpmBridge, CpmRefusal};
 use ecod_interop::cpm::{self, CpmCell, CpmError, ReceivedCpm, StationIds};
-use ecod_testkit::{node_config, tls_files};
+use ecod_testkit::node_config;
 use rumqttc::{Client, Event, Incoming, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
@@ -383,7 +383,7 @@ fn with_certificates_a_program_of_the_node_publishes_cpms() {
     authority
         .issue(&name, Role::Edge, Duration::from_secs(86_400), time)
         .unwrap();
-    let files = tls_files(&authority, &name);
+    let files = authority.tls_of(&name);
     let client = Tls::of_door(files.ca.clone(), &files.certificate, &files.key);
     let edge = Edge::start(Some((files, client)));
     let (sender, reader) = (

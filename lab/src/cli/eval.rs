@@ -226,7 +226,7 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
     }
 }
 
-/// Why a line is neither a map nor verdicts; `None` stands for a line that is too long.
+/// The fault of a line that cannot be used; `None` stands for a line that is too long.
 fn fault_of(line: Option<&[u8]>) -> String {
     let Some(line) = line else {
         return format!("it is longer than {MAX_LINE_BYTES} bytes");

@@ -122,7 +122,7 @@ mod tests {
 
     use super::*;
     use crate::platform::clock;
-    use crate::transport::pki::{Authority, TlsConfig};
+    use crate::transport::pki::Authority;
 
     fn message(from: &'static str, body: Body) -> ElectionMessage {
         ElectionMessage {
@@ -155,14 +155,7 @@ mod tests {
             authority
                 .issue(&name, Role::Edge, Duration::from_secs(60), clock::now())
                 .unwrap();
-            let (certificate, key) = authority.files_of(&name);
-            let files = TlsConfig {
-                ca: authority.ca(),
-                certificate,
-                key,
-                revocation_list: None,
-                city: None,
-            };
+            let files = authority.tls_of(&name);
             Arc::new(Credentials::load(&files, &name).unwrap())
         };
         let [edge, euclid] = ["edge", "euclid"].map(&mut credentials);

@@ -1,5 +1,5 @@
-//! Renewal of certificates over the membership: of the node's own, and of other nodes' where the
-//! key of the cell's CA is at hand.
+//! Renewal of certificates over the membership: each node requests its own, and nodes that have the
+//! key of the cell's CA issue those of others.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -46,7 +46,7 @@ struct AnsweredRequest {
     certificate: Vec<u8>,
 }
 
-/// What follows from a message or from the time.
+/// An effect of a message or of a due time.
 pub(super) enum RenewalStep {
     /// Send a message to a node, which may be this one.
     Send(NodeName, RenewalMessage),
@@ -92,8 +92,8 @@ impl Renewals {
         }
     }
 
-    /// Requests a new certificate when the node's own ends soon. Observers share their node's
-    /// certificate and leave that to the node.
+    /// Requests a new certificate when the node's own ends soon. Observers share the certificate
+    /// of their node, which requests the new one.
     pub(super) fn check(&mut self, now: Timestamp) -> Option<RenewalStep> {
         let current = self.credentials.current();
         let is_due = current.identity.due_for_renewal(clock::wall()).is_some();
@@ -265,7 +265,7 @@ mod tests {
     use ecod::wire::Role;
 
     use super::*;
-    use crate::transport::pki::{Authority, TlsConfig};
+    use crate::transport::pki::Authority;
 
     const DAY: Duration = Duration::from_secs(86_400);
     const EUCLID: NodeName = NodeName::from_static("euclid");
@@ -280,14 +280,7 @@ mod tests {
         authority
             .issue(&EUCLID, Role::Auto, 10 * DAY, now - 9 * DAY)
             .unwrap();
-        let (certificate, key) = authority.files_of(&EUCLID);
-        let files = TlsConfig {
-            ca: authority.ca(),
-            certificate,
-            key,
-            revocation_list: None,
-            city: None,
-        };
+        let files = authority.tls_of(&EUCLID);
         Renewals::new(Credentials::load(&files, &EUCLID).unwrap().into(), EUCLID)
     }
 

@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs::{self, DirBuilder};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, lchown};
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -15,7 +15,7 @@ use crate::cli::installation;
 use crate::node::config::guidance::SERVICE_DIRECTORY;
 use crate::node::config::{END_OF_CONFIGURATION, NodeConfig};
 use crate::platform::bounded_file;
-use crate::platform::owner::is_root;
+use crate::platform::owner::{give, is_root};
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
 use crate::transport::pki::{CertificateSubject, CityTlsConfig, Credentials, TlsConfig};
@@ -175,7 +175,7 @@ impl NodeDirectory {
     /// Gives a file to the service's user, if this is the service's directory.
     fn hand_over(&self, path: &Path) -> std::io::Result<()> {
         match self.state_of_service.as_ref().map(fs::metadata) {
-            Some(Ok(owner)) => lchown(path, Some(owner.uid()), Some(owner.gid())),
+            Some(Ok(service)) => give(path, &service),
             _ => Ok(()),
         }
     }

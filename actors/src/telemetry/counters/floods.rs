@@ -1,5 +1,5 @@
-//! Distinction between a flood and a burst: a change of link or leader may deliver in a moment what
-//! had to wait before.
+//! Distinction between a flood and a burst: after a change of link or leader, messages that have
+//! waited arrive in a moment.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};

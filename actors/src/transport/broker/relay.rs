@@ -45,7 +45,7 @@ struct Activity {
     sent_us: AtomicU64,
 }
 
-/// Time without a byte from or to a client after which it is cut off rather than slow.
+/// Time after which a client whose connection stands still in both directions is cut off rather than slow.
 const CUT_OFF_AFTER: Duration = Duration::from_secs(5);
 
 const BUFFER_BYTES: usize = 8 * 1024;
@@ -117,8 +117,8 @@ impl RelayLimits {
         }
     }
 
-    /// Counts a message that a client does not read. One that has neither read nor sent for long is
-    /// cut off; another one reads too slowly.
+    /// Counts a message that waits too long for a client. If the connection has stood still in both
+    /// directions for [`CUT_OFF_AFTER`], the client is cut off; otherwise it reads too slowly.
     fn shed(&self, principal: &Principal, activity: &Activity) {
         if clock::now().since(activity.last()) >= CUT_OFF_AFTER {
             self.counters.shed_cut_off(principal.source());
@@ -285,7 +285,7 @@ mod tests {
 
     use super::*;
 
-    /// A cut network leaves a client that neither reads nor sends; one that is slow does either.
+    /// In a cut network both directions stand still; a slow client still reads or sends.
     #[test]
     fn a_client_that_neither_reads_nor_sends_is_named_as_cut_off_and_another_as_slow() {
         let principal = Principal::new(None, Ipv4Addr::new(10, 0, 0, 7).into(), false);

@@ -307,14 +307,7 @@ mod tests {
             authority
                 .issue(&name, Role::Edge, Duration::from_secs(3600), issued_at)
                 .unwrap();
-            let (certificate, key) = authority.files_of(&name);
-            let tls = TlsConfig {
-                ca: authority.ca(),
-                certificate,
-                key,
-                revocation_list: None,
-                city: None,
-            };
+            let tls = authority.tls_of(&name);
             let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
             let security =
                 Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();

@@ -22,7 +22,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 
 use super::subject::rights_uri;
-use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
+use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK, TlsConfig};
 pub use renewal::RenewalRefusal;
 
 use crate::platform::bounded_file;
@@ -367,6 +367,18 @@ impl Authority {
             nodes.join(format!("{node}.pem")),
             nodes.join(format!("{node}.key")),
         )
+    }
+
+    /// The files that a node of the cell needs, issued or not.
+    pub fn tls_of(&self, node: &NodeName) -> TlsConfig {
+        let (certificate, key) = self.files_of(node);
+        TlsConfig {
+            ca: self.ca(),
+            certificate,
+            key,
+            revocation_list: Some(self.revocation_list()),
+            city: None,
+        }
     }
 
     fn issuer(&self) -> Result<Issuer<'static, KeyPair>, AuthorityError> {

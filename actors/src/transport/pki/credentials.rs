@@ -575,14 +575,7 @@ mod tests {
         authority
             .issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now())
             .unwrap();
-        let (certificate, key) = authority.files_of(&euclid);
-        let files = TlsConfig {
-            ca: authority.ca(),
-            certificate,
-            key,
-            revocation_list: None,
-            city: None,
-        };
+        let files = authority.tls_of(&euclid);
         let credentials = Credentials::load(&files, &euclid).unwrap();
         assert!(
             credentials.check_rights(Role::Auto, 100).is_ok()

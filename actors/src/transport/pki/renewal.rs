@@ -32,7 +32,7 @@ pub(crate) enum RenewalMessage {
     Request(Vec<u8>),
     /// The new certificate in DER.
     Renewed(Vec<u8>),
-    /// The reason why there is none.
+    /// The reason for which the CA's node refuses the request.
     Refused(String),
 }
 

@@ -10,7 +10,7 @@ use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
-use ecod_testkit::{PATIENCE, free_gossip_address, greet, tls_files};
+use ecod_testkit::{PATIENCE, free_gossip_address, greet};
 use tempfile::TempDir;
 
 use crate::failover::cell::config;
@@ -76,7 +76,7 @@ fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
     authority
         .issue(&node, role, Duration::from_secs(3600), clock::now())
         .unwrap();
-    Some(tls_files(&authority, &node))
+    Some(authority.tls_of(&node))
 }
 
 /// Where a cell that has certificates keeps its CA.

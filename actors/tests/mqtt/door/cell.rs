@@ -14,7 +14,7 @@ use ecod_actors::node::NodeHandle;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, BrokerTrust, Credentials};
-use ecod_testkit::{loopback, node_config, tls_files};
+use ecod_testkit::{loopback, node_config};
 use rumqttc::v5::mqttbytes::QoS;
 use rumqttc::v5::mqttbytes::v5::Packet;
 use rumqttc::v5::{AsyncClient, Event, MqttOptions};
@@ -139,7 +139,7 @@ impl Cell {
                     clock::now(),
                 )
                 .unwrap();
-            config.tls = Some(tls_files(authority, &node));
+            config.tls = Some(authority.tls_of(&node));
         }
         adjust(&mut config);
         config.validate().unwrap();
@@ -164,7 +164,7 @@ impl Cell {
         };
         let owner = NodeName::new(owner).unwrap();
         let id = format!("{owner}--{id}-{}", Uuid::new_v4().simple());
-        let credentials = Credentials::load(&tls_files(authority, &owner), &owner).unwrap();
+        let credentials = Credentials::load(&authority.tls_of(&owner), &owner).unwrap();
         let tls = TlsConfiguration::Rustls(BrokerTrust::of_door(&credentials).client());
         let mut options = MqttOptions::new(id, door.ip().to_string(), door.port());
         options.set_transport(Transport::tls_with_config(tls));

@@ -15,7 +15,6 @@ use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
-use ecod_testkit::tls_files;
 use rustls::ClientConfig;
 use serde::Deserialize;
 use tempfile::TempDir;
@@ -507,7 +506,7 @@ fn issue(
 ) -> anyhow::Result<TlsConfig> {
     let name = NodeName::new(name)?;
     authority.issue(&name, rights, Duration::from_secs(86_400), clock::now())?;
-    Ok(tls_files(authority, &name))
+    Ok(authority.tls_of(&name))
 }
 
 fn configuration(

@@ -7,7 +7,6 @@ use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, Role, encode};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, EvidenceSigner, TlsConfig};
-use ecod_testkit::tls_files;
 
 use tokio::time::sleep;
 
@@ -62,7 +61,7 @@ async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
     let mut authority = Authority::open(&pki)?;
     let files = TlsConfig {
         revocation_list: None,
-        ..tls_files(&authority, &leader)
+        ..authority.tls_of(&leader)
     };
     let signer = EvidenceSigner::new(
         NodeName::from_static(CELL),

@@ -5,8 +5,7 @@ use std::io;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::Path;
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use pem::Pem;
 use rustls::pki_types::UnixTime;
 use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
@@ -52,7 +51,11 @@ impl Credentials {
         let former = bounded_file::read_text(&files.key)
             .map_err(|error| file_error("tls.key", &files.key, &error))?;
         write("tls.key", &files.key, &format!("{former}\n{secret}"))?;
-        write("tls.certificate", &files.certificate, &pem_of(certificate))?;
+        write(
+            "tls.certificate",
+            &files.certificate,
+            &pem::encode(&Pem::new("CERTIFICATE", certificate)),
+        )?;
         write("tls.key", &files.key, secret)
     }
 }
@@ -65,20 +68,6 @@ fn replace_like_before(path: &Path, text: &str) -> io::Result<()> {
         return Ok(());
     }
     give(path, &former)
-}
-
-/// A certificate in PEM.
-fn pem_of(certificate: &[u8]) -> String {
-    let encoded = STANDARD.encode(certificate);
-    let lines: Vec<_> = encoded
-        .as_bytes()
-        .chunks(64)
-        .map(String::from_utf8_lossy)
-        .collect();
-    format!(
-        "-----BEGIN CERTIFICATE-----\n{}\n-----END CERTIFICATE-----\n",
-        lines.join("\n")
-    )
 }
 
 #[cfg(test)]
@@ -112,14 +101,7 @@ mod tests {
         authority
             .issue(&EUCLID, Role::Auto, 10 * DAY, issued_at)
             .unwrap();
-        let (certificate, key) = authority.files_of(&EUCLID);
-        let files = TlsConfig {
-            ca: authority.ca(),
-            certificate,
-            key,
-            revocation_list: None,
-            city: None,
-        };
+        let files = authority.tls_of(&EUCLID);
         Machine {
             _directory: directory,
             authority,
