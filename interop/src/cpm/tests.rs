@@ -193,9 +193,9 @@ proptest! {
         prop_assert_eq!(invalid, Vec::new());
         let message = encode_map(&sent, &cell(rotation_deg), 7, &mut ObjectIds::default(), |_| true).unwrap();
         let received = decode(&message.bytes, &origin(rotation_deg)).unwrap();
-        // Objects that were last detected over two seconds ago are not used.
+        // Objects that were last detected over a second ago are not used.
         let all = sent.objects.len() + sent.landmarks.len();
-        let old = sent.objects.iter().filter(|object| object.age_s.unwrap_or(0.0) > 2.0).count();
+        let old = sent.objects.iter().filter(|object| object.age_s.unwrap_or(0.0) > 1.0).count();
         let counted = received.objects.len() + message.left_out;
         prop_assert!((all - old..=all).contains(&counted), "{} of {}, {} old", counted, all, old);
         for object in &sent.objects[..5] {
