@@ -94,10 +94,8 @@ fn round(
         std::hint::black_box(pace.close(now));
     });
     let detections = vehicles * objects;
-    let (least_ms, median_ms) = (
-        times[0].as_secs_f64() * 1e3,
-        median(&times).as_secs_f64() * 1e3,
-    );
+    let least_ms = times[0].as_secs_f64() * 1e3;
+    let median_ms = median(&times).as_secs_f64() * 1e3;
     let per_detection_ns = least_ms * 1e6 / detections as f64;
     println!(
         "{name:<6} {detections:>10} {landmarks:>10} {least_ms:>10.3} {per_detection_ns:>14.1}"
@@ -170,8 +168,10 @@ fn projections(figures: &mut Figures) {
 
 /// A box somewhere in the image.
 fn detection(index: usize) -> Detection {
-    let (x_min, y_min) = (10.0 + (index % 500) as f64, 100.0 + (index % 97) as f64);
-    let (width, height) = (20.0 + (index % 80) as f64, 30.0 + (index % 60) as f64);
+    let x_min = 10.0 + (index % 500) as f64;
+    let y_min = 100.0 + (index % 97) as f64;
+    let width = 20.0 + (index % 80) as f64;
+    let height = 30.0 + (index % 60) as f64;
     Detection {
         label: if index.is_multiple_of(10) {
             "truck".into()
@@ -256,7 +256,8 @@ fn votes(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Objec
         .iter_mut()
         .zip(report.seen.take().into_iter().flatten())
     {
-        (object.label, object.landmark) = ("ABCD123".into(), Some(landmark));
+        object.label = "ABCD123".into();
+        object.landmark = Some(landmark);
     }
     report
 }

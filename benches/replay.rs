@@ -32,7 +32,8 @@ fn main() {
             .into_iter()
             .min_by(|a, b| a.0.total_cmp(&b.0))
             .unwrap_or_default();
-        let (rate, megabytes) = (lines.len() as f64 / seconds, read as f64 / seconds / 1e6);
+        let rate = lines.len() as f64 / seconds;
+        let megabytes = read as f64 / seconds / 1e6;
         println!(
             "{topic:<16} {:>10} {rate:>12.0} {written:>14} {megabytes:>12.1}",
             lines.len()

@@ -60,10 +60,8 @@ fn round(figures: &mut Figures, observers: u32) -> f64 {
         .skip(15)
         .collect();
     times.sort();
-    let (least_ms, median_ms) = (
-        times[0].as_secs_f64() * 1e3,
-        times[times.len() / 2].as_secs_f64() * 1e3,
-    );
+    let least_ms = times[0].as_secs_f64() * 1e3;
+    let median_ms = times[times.len() / 2].as_secs_f64() * 1e3;
     let report_us = median_ms * 1e3 / f64::from(observers);
     println!(
         "{observers:>10} {:>10} {median_ms:>10.2} {report_us:>12.1}",
@@ -81,10 +79,8 @@ fn report(observer: u32, observers: u32, frame: u64, now: Timestamp) -> ObjectRe
     let side = (f64::from(observers).sqrt() * PER_OBSERVER).ceil();
     let columns = (f64::from(observers)).sqrt().ceil() as u32;
     let step = side / f64::from(columns);
-    let (column, row) = (
-        f64::from(observer % columns) * step,
-        f64::from(observer / columns) * step,
-    );
+    let column = f64::from(observer % columns) * step;
+    let row = f64::from(observer / columns) * step;
     let across = (OBJECTS as f64).sqrt().ceil() as usize;
     let object = |n: usize| {
         let jitter =

@@ -36,7 +36,8 @@ impl Detect for RedBalls {
 }
 
 fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
-    let (mut hsv, mut mask) = (Mat::default(), Mat::default());
+    let mut hsv = Mat::default();
+    let mut mask = Mat::default();
     imgproc::cvt_color_def(image, &mut hsv, imgproc::COLOR_BGR2HSV)?;
     // OpenCV's hue of red is around 0.
     core::in_range(
@@ -55,12 +56,14 @@ fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
     let mut balls = Vec::new();
     for outline in outlines {
         let bounds = imgproc::bounding_rect(&outline)?;
-        let (width, height) = (f64::from(bounds.width), f64::from(bounds.height));
+        let width = f64::from(bounds.width);
+        let height = f64::from(bounds.height);
         // A disc fills π/4 of its box; the less a blob resembles one, the less sure it is.
         let fill = imgproc::contour_area_def(&outline)? / (width * height);
         let confidence = 1.0 - (fill / std::f64::consts::FRAC_PI_4 - 1.0).abs();
         if width * height >= LEAST_AREA_PX && confidence > 0.5 {
-            let (x_min, y_min) = (f64::from(bounds.x), f64::from(bounds.y));
+            let x_min = f64::from(bounds.x);
+            let y_min = f64::from(bounds.y);
             balls.push(Detection {
                 label: "red ball".into(),
                 confidence: confidence.clamp(0.0, 1.0),

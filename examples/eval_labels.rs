@@ -116,7 +116,9 @@ impl Names {
     }
 
     fn of(&mut self, name: &str) -> String {
-        let (kind, number, is_allowed) = (self.kind, self.known.len(), self.is_allowed);
+        let kind = self.kind;
+        let number = self.known.len();
+        let is_allowed = self.is_allowed;
         let given = || {
             if is_allowed(name) {
                 name.to_owned()
@@ -167,7 +169,8 @@ fn rows(path: &Path, columns: &[&str], required: usize) -> anyhow::Result<Vec<Ve
 /// Writes a set as a recording and its truth.
 fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
-    let (mut names, mut labels) = (Names::new("item", is_label), Names::new("label", is_label));
+    let mut names = Names::new("item", is_label);
+    let mut labels = Names::new("label", is_label);
     let mut workers = Names::new("worker", |name| NodeName::new(format!("w{name}")).is_ok());
     let mut items: BTreeMap<String, Vec<(String, String, f64)>> = BTreeMap::new();
     let path = set.join("label.csv");
@@ -260,7 +263,8 @@ fn place(
     let mut spans: BTreeMap<String, Vec<Value>> = BTreeMap::new();
     let mut item_before = None;
     for report in reports {
-        let (mut report, object) = (report.clone(), &report["objects"][0]);
+        let object = &report["objects"][0];
+        let mut report = report.clone();
         // An item without a known truth would be judged by that of the item before it.
         let Some(true_label) = object["landmark"].as_str().and_then(|item| truth.get(item)) else {
             continue;
@@ -393,7 +397,8 @@ fn judge(
     passes: u32,
     [reports, truth]: [&str; 2],
 ) -> anyhow::Result<Value> {
-    let (reports, output) = (work.join(reports), work.join(format!("{name}.jsonl")));
+    let reports = work.join(reports);
+    let output = work.join(format!("{name}.jsonl"));
     let mut replay = Command::new(&options.program);
     replay
         .arg("replay")
@@ -474,10 +479,8 @@ fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 }
 
 fn write_table(path: &Path, kind: &str, table: &str) -> anyhow::Result<()> {
-    let (begin, end) = (
-        format!("<!-- {kind} table begin -->\n"),
-        format!("<!-- {kind} table end -->"),
-    );
+    let begin = format!("<!-- {kind} table begin -->\n");
+    let end = format!("<!-- {kind} table end -->");
     let text = fs::read_to_string(path)?;
     let (before, rest) = text.split_once(&begin).context("no begin marker")?;
     let (_, after) = rest.split_once(&end).context("no end marker")?;
@@ -491,7 +494,8 @@ fn main() -> anyhow::Result<()> {
     let options = options()?;
     fs::create_dir_all(&options.work)?;
     let paper_config = paper_config(&options)?;
-    let (mut table, mut answers) = (HEADER.to_owned(), ANSWER_HEADER.to_owned());
+    let mut table = HEADER.to_owned();
+    let mut answers = ANSWER_HEADER.to_owned();
     print!("{table}");
     for set in sets(&options.sets)? {
         let name = fs::canonicalize(&set)?

@@ -86,10 +86,8 @@ struct Candidate {
 
 impl Candidate {
     fn new(name: &str) -> Result<Self, Box<dyn Error>> {
-        let (resync, ledger) = (
-            LedgerResync::signed(NodeName::new(name)?, 10),
-            ReputationLedger::default(),
-        );
+        let resync = LedgerResync::signed(NodeName::new(name)?, 10);
+        let ledger = ReputationLedger::default();
         Ok(Self {
             resync,
             ledger,
@@ -133,7 +131,8 @@ struct Cell {
 
 impl Cell {
     fn new() -> Result<Self, Box<dyn Error>> {
-        let (mut edge, mut euclid) = (Candidate::new("edge")?, Candidate::new("euclid")?);
+        let mut edge = Candidate::new("edge")?;
+        let mut euclid = Candidate::new("euclid")?;
         edge.go_by(2, "edge", Position::Leading)?;
         euclid.resync.lead(Epoch::new(1, NodeName::new("euclid")?));
         euclid.resync.step_down();
@@ -245,7 +244,8 @@ fn forged(term: u64, vehicles: usize, liars: usize) -> Result<LedgerShare, Box<d
         .map(|(vehicle, label)| entry(vehicle, label))
         .collect::<Result<_, Box<dyn Error>>>()?;
     let epoch = (term == 3).then_some(term);
-    let (schema, marks) = (SCHEMA_VERSION, Vec::new());
+    let schema = SCHEMA_VERSION;
+    let marks = Vec::new();
     Ok(signed(LedgerShare {
         schema,
         node: forger,
@@ -310,11 +310,9 @@ impl Trial {
 
     /// The flaw, if liars achieve more than the bound allows.
     fn flaw(&self) -> Option<String> {
-        let (worst, verdicts, honest) = (
-            self.worst(),
-            self.mean(|c| c.settled),
-            self.mean(|c| c.honest),
-        );
+        let worst = self.worst();
+        let verdicts = self.mean(|c| c.settled);
+        let honest = self.mean(|c| c.honest);
         let is_good = worst >= MIN_WORST && verdicts >= honest;
         let bound = format!("at least {MIN_WORST} and {honest:.1}, the honest majority's");
         (!is_good).then(|| {
@@ -368,7 +366,11 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         majority: 0.0,
         honest: 0.0,
     };
-    let (mut right, mut right_most, mut settled, mut majority, mut honest) = (0, 0.0, 0, 0.0, 0.0);
+    let mut right = 0;
+    let mut right_most = 0.0;
+    let mut settled = 0;
+    let mut majority = 0.0;
+    let mut honest = 0.0;
     let mut now = Timestamp(1_700_000_000_000_000);
     let mut truths = [0; LANDMARKS];
     let mut cell = Cell::new()?;
@@ -457,7 +459,8 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
             course
                 .accuracy
                 .push((right as f64 / judged, right_most / judged));
-            (right, right_most) = (0, 0.0);
+            right = 0;
+            right_most = 0.0;
             let reputations = vote.reputations();
             let mean = |prefix: &str| {
                 let scores: Vec<f64> = reputations
@@ -548,7 +551,10 @@ fn write_table(path: &str, table: &str) -> Result<(), Box<dyn Error>> {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let (mut svg, mut file, mut text, mut seeds) = (None, None, None, 5);
+    let mut svg = None;
+    let mut file = None;
+    let mut text = None;
+    let mut seeds = 5;
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args.next().ok_or_else(|| format!("{key} needs a value"))?;
@@ -562,7 +568,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let header = "| vehicles | faulty | kind | majority % | honest majority % | verdicts % | worst % | honest | faulty |\n\
          |---|---|---|---|---|---|---|---|---|\n";
-    let (mut table, mut shown) = (header.to_owned(), header.to_owned());
+    let mut table = header.to_owned();
+    let mut shown = header.to_owned();
     let mut trials = Vec::new();
     for vehicles in SIZES {
         for lie in LIES {

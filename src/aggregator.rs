@@ -530,8 +530,8 @@ impl Aggregator {
         let landmarks = pace.landmarks().landmarks();
         let sign = |place: usize| Some(&landmarks.get(place)?.vacancy.as_ref()?.label);
         let agreed = places.into_iter().enumerate().map(|(place, state)| {
-            let (verdict, readings) =
-                (known.get(&state.id).copied(), vote.readings(&state.id, now));
+            let verdict = known.get(&state.id).copied();
+            let readings = vote.readings(&state.id, now);
             answer::agree(state, verdict, readings, sign(place))
         });
         agreed.collect()

@@ -97,17 +97,20 @@ fn solve<C: Candidate>(
     limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,
     assigned: &mut Vec<C>,
 ) {
-    let (mut row_of, mut column_of) = (HashMap::new(), HashMap::new());
+    let mut row_of = HashMap::new();
+    let mut column_of = HashMap::new();
     let mut cells: Vec<(usize, usize)> = Vec::with_capacity(cluster.len());
     for candidate in cluster {
-        let (next_row, next_column) = (row_of.len(), column_of.len());
+        let next_row = row_of.len();
+        let next_column = column_of.len();
         let row = *row_of.entry(candidate.row()).or_insert(next_row);
         cells.push((
             row,
             *column_of.entry(candidate.column()).or_insert(next_column),
         ));
     }
-    let (rows, columns) = (row_of.len(), column_of.len());
+    let rows = row_of.len();
+    let columns = column_of.len();
     if let Some(settled) = limit(ClusterSize { rows, columns }, cluster) {
         assigned.extend(settled);
         return;

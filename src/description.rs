@@ -424,7 +424,8 @@ impl DescriptionExchange {
     }
 
     fn adopt(&mut self, next: AttributedDescription, stated_by: NodeName) {
-        let (description, stamp) = (Arc::clone(&next.description), next.description.stamp());
+        let description = Arc::clone(&next.description);
+        let stamp = next.description.stamp();
         self.history.replace(next);
         self.unproven.retain(|body| body.stamp() > stamp);
         self.published = None;

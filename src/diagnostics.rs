@@ -280,8 +280,10 @@ impl TroubleRegister {
         };
         if let Some(entry) = self.entries.get_mut(&key) {
             entry.times += 1;
-            let (is_present, age) = (entry.is_present(kind, now), now.since(entry.shown_at));
-            (entry.seen_at, entry.is_settled) = (now, false);
+            let is_present = entry.is_present(kind, now);
+            let age = now.since(entry.shown_at);
+            entry.seen_at = now;
+            entry.is_settled = false;
             let is_due = !is_present || age >= TEXT_INTERVAL;
             if is_due || !kind.is_counted() {
                 let cause = cause();
@@ -297,8 +299,10 @@ impl TroubleRegister {
                     } else {
                         String::new()
                     };
-                    (entry.shown, entry.shown_at, entry.gist, entry.times) =
-                        (shown(&cause, &rate), now, gist, 0);
+                    entry.shown = shown(&cause, &rate);
+                    entry.shown_at = now;
+                    entry.gist = gist;
+                    entry.times = 0;
                 }
             }
             let interval = if entry.gist == entry.logged_gist {
@@ -307,12 +311,14 @@ impl TroubleRegister {
                 NEW_CAUSE_INTERVAL
             };
             return (now.since(entry.logged_at) >= interval).then(|| {
-                (entry.logged_at, entry.logged_gist) = (now, entry.gist.clone());
+                entry.logged_at = now;
+                entry.logged_gist = entry.gist.clone();
                 entry.shown.clone()
             });
         }
         if !self.make_room(&key, now) {
-            let (about, kind) = (key.0.unwrap_or_default(), kind.as_str());
+            let about = key.0.unwrap_or_default();
+            let kind = kind.as_str();
             let cause =
                 format!("there are more troubles than have room here, such as {kind} of {about}");
             return self.note(TroubleKind::NotShown, None, &cause, now);

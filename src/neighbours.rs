@@ -135,10 +135,8 @@ impl Neighbours {
         } = message;
         let fused_at = received_at - age;
         let clock_us = fused_at.micros_from(map.fused_at_us);
-        let (change, area) = (
-            FrameChange::new(&origin, &self.origin),
-            CoveredArea::of(topic.tile),
-        );
+        let change = FrameChange::new(&origin, &self.origin);
+        let area = CoveredArea::of(topic.tile);
         let losses = self.losses.entry(cell.clone()).or_default();
         let mut near = Vec::new();
         for mut object in map.objects {
@@ -200,7 +198,8 @@ impl Neighbours {
     pub fn near(&mut self, now: Timestamp) -> Vec<NeighbourObject> {
         self.forget_silent(now);
         let of_cell = |(cell, map): (&NodeName, &NeighbourMap)| {
-            let (cell, age_s) = (cell.clone(), now.since(map.fused_at).as_secs_f64());
+            let cell = cell.clone();
+            let age_s = now.since(map.fused_at).as_secs_f64();
             let objects = map.objects.clone().into_iter();
             objects.map(move |object| NeighbourObject {
                 cell: cell.clone(),

@@ -192,9 +192,11 @@ impl Replay {
                 ..
             } = &mut config.fusion;
             *algorithms = Algorithms::Vote;
-            (vote.weighted.freshness_s, vote.weighted.hysteresis) = (FOREVER_S, 0.0);
+            vote.weighted.freshness_s = FOREVER_S;
+            vote.weighted.hysteresis = 0.0;
             vote.weighted.smoothing_share = 0.0;
-            (vote.max_landmarks, vote.max_labels) = (MAX_VOTE_LANDMARKS, MAX_LABELS);
+            vote.max_landmarks = MAX_VOTE_LANDMARKS;
+            vote.max_labels = MAX_LABELS;
             vote.max_vehicles = vote.max_vehicles.max(window.max_vehicles);
         }
         Self {
@@ -328,7 +330,8 @@ impl Replay {
         let is_late = is_plausible && self.clock.advance(line.at);
         let now = self.clock.now();
         if self.config.passes.is_some() {
-            (line.report.captured_at_us, line.report.seq) = (now, number);
+            line.report.captured_at_us = now;
+            line.report.seq = number;
         }
         // Objects are at their landmark, but their distance from the reporter can only be derived
         // from a configured landmark.

@@ -118,7 +118,8 @@ impl CellChoice {
         let nearest = others
             .map(|cell| (cell.outside_m(place), &cell.name))
             .min_by(|a, b| a.0.total_cmp(&b.0))?;
-        let (nearest_m, name) = (nearest.0, nearest.1.clone());
+        let nearest_m = nearest.0;
+        let name = nearest.1.clone();
         if nearest_m > 0.0 || nearest_m + MARGIN_M >= present_m {
             return None;
         }
@@ -202,7 +203,8 @@ mod tests {
     /// all changes.
     fn drive(path: impl Fn(f64) -> (f64, f64), seconds: f64) -> Vec<(f64, NodeName)> {
         let mut choice = CellChoice::new(cells(), name(0));
-        let (mut changes, mut joined) = (Vec::new(), None);
+        let mut changes = Vec::new();
+        let mut joined = None;
         for tick in 0..(10.0 * seconds) as usize {
             let now_s = 0.1 * tick as f64;
             let (x_m, y_m) = path(now_s);
@@ -324,7 +326,8 @@ mod tests {
         #[test]
         fn one_cell_at_a_time_is_joined(places in prop::collection::vec((-400.0..1000.0, -300.0..300.0, 0.0..20.0), 1..60)) {
             let mut choice = CellChoice::new(cells(), name(0));
-            let (mut now_s, mut joined) = (0.0, None);
+            let mut now_s = 0.0;
+            let mut joined = None;
             for (x_m, y_m, passed_s) in places {
                 now_s += passed_s;
                 match choice.observe(Some(&at(x_m, y_m)), s(now_s)) {

@@ -240,7 +240,8 @@ impl Vote {
                 captured_at: report.captured_at_us,
             },
         );
-        (last.received_at, last.frames) = (received_at, last.frames.saturating_add(1));
+        last.received_at = received_at;
+        last.frames = last.frames.saturating_add(1);
         let objects = match self.config.mode {
             VoteMode::Weighted => self.one_per_landmark(&report.objects),
             VoteMode::Paper => report.objects.iter().collect(),

@@ -108,7 +108,8 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 /// The node of this configuration, if it runs on this machine.
 async fn own_node(config: &NodeConfig) -> Option<Finding> {
     let node = RunningNode::find(config).await?;
-    let (name, RunningReadiness { ready, reason }) = (&node.node.name, &node.readiness);
+    let name = &node.node.name;
+    let RunningReadiness { ready, reason } = &node.readiness;
     let seen = format!("{name} runs: {reason}");
     Some(if *ready {
         Finding::fine("node", seen)
@@ -194,7 +195,8 @@ mod tests {
 
     /// Issues certificates for 60 days into the directory.
     fn certificates(config: &NodeConfig, directory: &Path) -> TlsConfig {
-        let (now, name) = (crate::platform::clock::now(), NodeName::from_static("edge"));
+        let now = crate::platform::clock::now();
+        let name = NodeName::from_static("edge");
         let mut authority = Authority::init(directory, &config.cell, now).unwrap();
         authority
             .issue(&name, Role::Edge, Duration::from_secs(60 * 86_400), now)
@@ -229,12 +231,11 @@ mod tests {
 
     #[tokio::test]
     async fn a_certificate_of_another_ca_or_a_revoked_one_is_broken() {
-        let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let directory = tempfile::tempdir().unwrap();
+        let elsewhere = tempfile::tempdir().unwrap();
         let mut config = config();
-        let (files, others) = (
-            certificates(&config, directory.path()),
-            certificates(&config, elsewhere.path()),
-        );
+        let files = certificates(&config, directory.path());
+        let others = certificates(&config, elsewhere.path());
         for ca in [&files, &others] {
             std::fs::set_permissions(&ca.key, Permissions::from_mode(0o600)).unwrap();
         }
@@ -282,15 +283,14 @@ mod tests {
 
     #[tokio::test]
     async fn ports_in_use_are_named() {
-        let (tcp, udp) = (
-            TcpListener::bind("127.0.0.1:0").unwrap(),
-            UdpSocket::bind("127.0.0.1:0").unwrap(),
-        );
+        let tcp = TcpListener::bind("127.0.0.1:0").unwrap();
+        let udp = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut config = config();
         config.listen = tcp.local_addr().ok();
         config.membership.bind = udp.local_addr().ok();
         let page = TcpListener::bind("127.0.0.1:0").unwrap();
-        (config.dashboard.enabled, config.dashboard.listen) = (true, page.local_addr().ok());
+        config.dashboard.enabled = true;
+        config.dashboard.listen = page.local_addr().ok();
         for (check, port, key) in [
             ("broker port", tcp.local_addr().unwrap().port(), "`listen`"),
             (
@@ -445,11 +445,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_cell_that_does_not_accept_the_nodes_certificate_is_doubtful() {
-        let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let (own, other) = (
-            certificates(&config(), directory.path()),
-            certificates(&config(), elsewhere.path()),
-        );
+        let directory = tempfile::tempdir().unwrap();
+        let elsewhere = tempfile::tempdir().unwrap();
+        let own = certificates(&config(), directory.path());
+        let other = certificates(&config(), elsewhere.path());
         let file = directory.path().join("cells.toml");
         let cell = |name, ca: &Path| {
             format!(
@@ -476,10 +475,8 @@ mod tests {
     #[cfg(feature = "foxglove")]
     #[tokio::test]
     async fn a_live_port_in_use_is_named() {
-        let (live, directory) = (
-            TcpListener::bind("127.0.0.1:0").unwrap(),
-            tempfile::tempdir().unwrap(),
-        );
+        let live = TcpListener::bind("127.0.0.1:0").unwrap();
+        let directory = tempfile::tempdir().unwrap();
         let live_port = Some(live.local_addr().unwrap().port());
         let record = Some(RecordConfig {
             live_port,
@@ -575,7 +572,8 @@ mod tests {
         edge.membership.key = Some(Secret::new("correct horse battery"));
         let edge = crate::node::start(edge).await.unwrap();
         let mut config = config();
-        (config.name, config.role) = (Some(NodeName::from_static("euclid")), Role::Cav);
+        config.name = Some(NodeName::from_static("euclid"));
+        config.role = Role::Cav;
         config.cell = NodeName::from_static("ux-lot");
         config.membership.key = Some(Secret::new(key));
         config.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
@@ -655,7 +653,8 @@ mod tests {
     #[tokio::test]
     async fn keys_and_directories_that_cannot_be_used_are_named() {
         let directory = tempfile::tempdir().unwrap();
-        let (short, file) = (directory.path().join("key"), directory.path().join("file"));
+        let short = directory.path().join("key");
+        let file = directory.path().join("file");
         std::fs::write(&short, "short").unwrap();
         std::fs::write(&file, "").unwrap();
         let mut config = config();

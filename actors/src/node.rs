@@ -189,20 +189,19 @@ async fn start_with(
         .map_err(|error| NodeError::Failed(error.to_string()))?;
     let builder =
         NodeBuilder::new(vehicle, config, security, held, failed).with_floor_plan(floor_plan);
-    let (newest, broker, gossip) = (
-        builder.newest(),
-        builder.broker_address(),
-        builder.gossip_address(),
-    );
-    let (members, leadership) = (builder.members(), builder.leadership());
-    let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
-    let (slots, counters) = (builder.slots().clone(), builder.counters());
+    let newest = builder.newest();
+    let broker = builder.broker_address();
+    let gossip = builder.gossip_address();
+    let members = builder.members();
+    let leadership = builder.leadership();
+    let dashboard = builder.dashboard_address();
+    let listens_at = builder.listens_at();
+    let slots = builder.slots().clone();
+    let counters = builder.counters();
     let frames = builder.frames();
-    let (live_state, shared, name) = (
-        builder.live_state(),
-        builder.shared(),
-        builder.name().clone(),
-    );
+    let live_state = builder.live_state();
+    let shared = builder.shared();
+    let name = builder.name().clone();
     let started = Actor::spawn(None, Supervisor, builder).await;
     let (supervisor, ended) =
         started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
@@ -447,7 +446,8 @@ impl Actor for Supervisor {
 
 impl SupervisorState {
     fn log_health(&mut self) {
-        let (counters, frames) = (self.builder.counters(), self.builder.frames());
+        let counters = self.builder.counters();
+        let frames = self.builder.frames();
         self.health.log(&counters, &frames);
     }
 

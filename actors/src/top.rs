@@ -226,7 +226,8 @@ fn locations(view: &mut CellView, height: u16) -> Table<'static> {
     let room = usize::from(height.saturating_sub(3)).max(1);
     let rows = location_rows(view);
     view.scroll = view.scroll.min(rows.len().saturating_sub(room));
-    let (first, last) = (view.scroll, rows.len().min(view.scroll + room));
+    let first = view.scroll;
+    let last = rows.len().min(view.scroll + room);
     let title = match rows.len() {
         all if all > room => format!(" what is where, {} to {last} of {all} ", first + 1),
         _ => " what is where ".to_owned(),
@@ -590,7 +591,8 @@ mod tests {
             (7_200_000, "newest round 300 ms old"),
             (12_000_000, "STALE: no round for 5 s"),
         ] {
-            let (verdicts, history) = (verdicts.clone(), VecDeque::clone(&history));
+            let verdicts = verdicts.clone();
+            let history = VecDeque::clone(&history);
             let mut voting = CellView {
                 map: None,
                 verdicts,
@@ -629,7 +631,8 @@ mod tests {
     #[test]
     fn what_finds_no_room_is_said_and_scrolled_to() {
         // Two locations and an object, and room for two lines.
-        let (mut view, height) = (view(Timestamp(7_200_000)), 4 + 5 + 9 + 1);
+        let mut view = view(Timestamp(7_200_000));
+        let height = 4 + 5 + 9 + 1;
         let text = shown(&mut view, 100, height);
         assert!(
             text.contains("what is where, 1 to 2 of 3") && !text.contains("van"),

@@ -196,8 +196,10 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
     tokio::time::sleep(Duration::from_secs(1)).await;
 
     let sleepers = Sleepers::start();
-    let (begun, before) = (Instant::now(), resident_bytes());
-    let (mut last, mut gaps) = (begun, Vec::new());
+    let begun = Instant::now();
+    let before = resident_bytes();
+    let mut last = begun;
+    let mut gaps = Vec::new();
     while begun.elapsed() < Duration::from_secs(3) {
         tokio::time::timeout(PATIENCE, maps.changed())
             .await

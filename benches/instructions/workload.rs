@@ -55,8 +55,10 @@ pub fn boxes() -> (Projection, Pose, Vec<Detection>) {
 }
 
 fn detection(index: usize) -> Detection {
-    let (x_min, y_min) = (10.0 + (index % 500) as f64, 100.0 + (index % 97) as f64);
-    let (width, height) = (20.0 + (index % 80) as f64, 30.0 + (index % 60) as f64);
+    let x_min = 10.0 + (index % 500) as f64;
+    let y_min = 100.0 + (index % 97) as f64;
+    let width = 20.0 + (index % 80) as f64;
+    let height = 30.0 + (index % 60) as f64;
     Detection {
         label: "car".into(),
         confidence: 0.5 + (index % 50) as f64 / 100.0,

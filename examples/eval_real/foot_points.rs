@@ -37,7 +37,8 @@ pub(super) fn print(data: &Wildtrack) {
             pitch_rad,
             ..
         } = camera.mount;
-        let (height_m, pitch_deg) = (height_m.unwrap_or_default(), pitch_rad.to_degrees());
+        let height_m = height_m.unwrap_or_default();
+        let pitch_deg = pitch_rad.to_degrees();
         row(
             &format!("{} | {height_m:.2} m | {pitch_deg:.1}°", number + 1),
             &errors,
@@ -93,7 +94,8 @@ fn errors(
             boxes.iter().filter(|cells| cells[5] as usize == number)
         {
             // The middles of whole pixels.
-            let (x_min, y_min) = (left + 0.5, top + 0.5);
+            let x_min = left + 0.5;
+            let y_min = top + 0.5;
             let bounding_box = BoundingBox {
                 x_min,
                 y_min,

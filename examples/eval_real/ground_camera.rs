@@ -22,7 +22,8 @@ impl GroundCamera {
     pub(super) fn new(homography: &Matrix3<f64>) -> Option<Self> {
         let [h1, h2, h3] = [0, 1, 2].map(|column| homography.column(column).into_owned());
         let moments = h1 * h1.transpose() + h2 * h2.transpose();
-        let (middle, cos_square) = (Complex::new(moments.m13, moments.m23), moments.m33);
+        let middle = Complex::new(moments.m13, moments.m23);
+        let cos_square = moments.m33;
         let sin = -(1.0 - cos_square).sqrt();
         let difference = Complex::new(moments.m11 - moments.m22, 2.0 * moments.m12);
         let root = (middle * middle - difference * cos_square).sqrt();
@@ -35,7 +36,8 @@ impl GroundCamera {
         let vertical = verticals
             .into_iter()
             .min_by(|a, b| off(a).total_cmp(&off(b)))?;
-        let (Complex { re: cx, im: cy }, [width, height]) = (principal(&vertical), IMAGE);
+        let Complex { re: cx, im: cy } = principal(&vertical);
+        let [width, height] = IMAGE;
         let focal = (moments.m11 - cx * cx + vertical.re * vertical.re).sqrt();
         let intrinsics = Intrinsics {
             width,
@@ -49,7 +51,9 @@ impl GroundCamera {
             .map(|h| Vector3::new((h.x - cx * h.z) / focal, (h.y - cy * h.z) / focal, h.z));
         let to_world = Matrix3::from_columns(&[r1, r2, r1.cross(&r2)]).transpose();
         let position = -to_world * t / 100.0;
-        let (right, down, axis) = (to_world.column(0), to_world.column(1), to_world.column(2));
+        let right = to_world.column(0);
+        let down = to_world.column(1);
+        let axis = to_world.column(2);
         let mount = Mount {
             height_m: Some(position.z),
             pitch_rad: (-axis.z).asin(),

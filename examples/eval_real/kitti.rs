@@ -52,10 +52,8 @@ pub(super) fn convert(
         }
         fs::write(own_detections.join(&file), merged)?;
     }
-    let (truth, detections) = (
-        FileFormat::Kitti.read(&own_truth, FileContext::default())?,
-        FileFormat::Kitti.read(&own_detections, FileContext::default())?,
-    );
+    let truth = FileFormat::Kitti.read(&own_truth, FileContext::default())?;
+    let detections = FileFormat::Kitti.read(&own_detections, FileContext::default())?;
     let mut reports = Vec::new();
     for (number, (truth, detections)) in truth.iter().zip(&detections).enumerate() {
         reports.extend(detections.reports(

@@ -67,11 +67,9 @@ struct Recording {
 }
 
 fn main() -> anyhow::Result<()> {
-    let (mut program, mut data, mut work) = (
-        PathBuf::from("target/release/ecod-node"),
-        PathBuf::new(),
-        PathBuf::from("target/eval-real"),
-    );
+    let mut program = PathBuf::from("target/release/ecod-node");
+    let mut data = PathBuf::new();
+    let mut work = PathBuf::from("target/eval-real");
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args
@@ -221,7 +219,8 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
     let figure =
         |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));
     let share = |value: &Value| figure(value, 1);
-    let (at, calibration) = (&tracks["at_best_f1"], &tracks["calibration"]);
+    let at = &tracks["at_best_f1"];
+    let calibration = &tracks["calibration"];
     let mut cells: Vec<Option<String>> = (0..4)
         .map(|place| share(&tracks["ap_pct"][place]))
         .collect();

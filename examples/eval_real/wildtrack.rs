@@ -111,16 +111,21 @@ impl Wildtrack {
     }
 
     pub(super) fn convert(&self, work: &Path) -> anyhow::Result<Recording> {
-        let (truth, reports) = (work.join("truth.txt"), work.join("reports.jsonl"));
+        let truth = work.join("truth.txt");
+        let reports = work.join("reports.jsonl");
         let to_ground: Option<Vec<_>> = self
             .homographies
             .iter()
             .map(|homography| homography.try_inverse())
             .collect();
         let to_ground = to_ground.context("a homography has no inverse")?;
-        let (mut places, mut all, mut late_fusion) = (String::new(), String::new(), String::new());
-        let (mut alone, mut reported) = (vec![String::new(); to_ground.len()], Vec::new());
-        let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
+        let mut places = String::new();
+        let mut all = String::new();
+        let mut late_fusion = String::new();
+        let mut alone = vec![String::new(); to_ground.len()];
+        let mut reported = Vec::new();
+        let mut latest = LatestReports::default();
+        let mut tracker = NearestTracker::default();
         for (number, (frame, boxes)) in (1..).zip(&self.boxes) {
             for place in self.positions.get(frame).into_iter().flatten() {
                 writeln!(places, "{}", line(number, 1.0, place))?;
@@ -194,7 +199,8 @@ fn object(&[left, top, width, height, ..]: &[f64; 6], to_ground: &Matrix3<f64>) 
         // Centimetres.
         Point2::new(place.x / place.z, place.y / place.z) / 100.0
     };
-    let (x, y) = (left + width / 2.0, top + height);
+    let x = left + width / 2.0;
+    let y = top + height;
     let place = ground(x, y);
     let steps = [
         ground(x + FOOT_PIXELS, y) - place,

@@ -179,9 +179,11 @@ fn run(
 ) -> anyhow::Result<[TrackScores; METHODS.len()]> {
     let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
     let judge = || TrackEvaluation::new(truth.clone());
-    let (mut union, mut late, mut ours) = (judge(), judge(), judge());
-    let (mut union_tracker, mut late_tracker) =
-        (NearestTracker::default(), NearestTracker::default());
+    let mut union = judge();
+    let mut late = judge();
+    let mut ours = judge();
+    let mut union_tracker = NearestTracker::default();
+    let mut late_tracker = NearestTracker::default();
     let mut latest = LatestReports::default();
     for map in maps(recording, &mut |event| match event {
         Event::Report(report) => latest.report(report),

@@ -93,7 +93,8 @@ async fn play(cell: &mut Cell) -> anyhow::Result<()> {
         let epoch = epoch.with_context(|| format!("no leader serves all within {PATIENCE:?}"))?;
         let recovered_at = age();
         tokio::time::sleep(CALM).await;
-        let (Record { gap_ms, .. }, (map, votes)) = (cell.record(from)?, cell.agreed());
+        let Record { gap_ms, .. } = cell.record(from)?;
+        let (map, votes) = cell.agreed();
         println!(
             "{recovered_at:>5.1} s  {:<34}{gap_ms:>5} ms  {map:<20}{votes}",
             format!("{epoch} leads")

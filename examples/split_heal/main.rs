@@ -104,10 +104,8 @@ impl Cell {
         self.run_for(NOTICE_MS)?;
         for node in 0..SEEN.len() {
             for other in (0..SEEN.len()).filter(|other| *other != node) {
-                let (member, is_linked) = (
-                    self.vehicles[other].as_member(),
-                    self.is_linked(node, other),
-                );
+                let member = self.vehicles[other].as_member();
+                let is_linked = self.is_linked(node, other);
                 self.vehicles[node].notice(member, is_linked, self.now);
             }
         }

@@ -65,7 +65,8 @@ struct Object {
 fuzz_target!(|cell: Cell| {
     let mut config = FusionConfig::default();
     if cell.paper {
-        (config.pace.mode, config.vote.mode) = (PaceMode::Paper, VoteMode::Paper);
+        config.pace.mode = PaceMode::Paper;
+        config.vote.mode = VoteMode::Paper;
     }
     config.tracks.mode = if cell.tracks {
         TracksMode::On
@@ -170,7 +171,8 @@ fn object(object: &Object) -> PerceivedObject {
         .at
         .map(|length| (f64::from(length) * unit).clamp(-1e8, 1e8));
     let spread = |(xx, yy, correlation): (u16, u16, i8)| {
-        let (xx, yy) = (f64::from(xx) * unit * unit, f64::from(yy) * unit * unit);
+        let xx = f64::from(xx) * unit * unit;
+        let yy = f64::from(yy) * unit * unit;
         [xx, f64::from(correlation) / 128.0 * (xx * yy).sqrt(), yy]
     };
     let scores: BTreeMap<_, _> = object

@@ -21,7 +21,8 @@ const HONEST: &[u8] = br#"{"schema":1,"node":"edge","epoch":7,"entries":[
 
 /// The signer of `edge`, and a share that it signed.
 static EDGE: LazyLock<(Mutex<EvidenceSigner>, LedgerShare)> = LazyLock::new(|| {
-    let (cell, edge) = (NodeName::from_static("lot"), NodeName::from_static("edge"));
+    let cell = NodeName::from_static("lot");
+    let edge = NodeName::from_static("edge");
     let directory = std::env::temp_dir().join(format!("fuzz-share-{}", std::process::id()));
     let mut authority = Authority::init(&directory, &cell, clock::now()).expect("a new directory");
     authority
@@ -46,13 +47,11 @@ static EDGE: LazyLock<(Mutex<EvidenceSigner>, LedgerShare)> = LazyLock::new(|| {
 
 /// The share with all counts and marks in one lane of `edge`, under its signature: `edge` may be the attacker.
 fn signed_by_edge(signer: &EvidenceSigner, share: &LedgerShare) -> LedgerShare {
-    let (mut share, edge) = (
-        LedgerShare {
-            signed: None,
-            ..share.clone()
-        },
-        NodeName::from_static("edge"),
-    );
+    let mut share = LedgerShare {
+        signed: None,
+        ..share.clone()
+    };
+    let edge = NodeName::from_static("edge");
     let terms = share
         .entries
         .iter()
@@ -60,10 +59,12 @@ fn signed_by_edge(signer: &EvidenceSigner, share: &LedgerShare) -> LedgerShare {
         .chain(share.marks.iter().map(|mark| mark.epoch));
     let term = terms.min().unwrap_or_default();
     for entry in &mut share.entries {
-        (entry.epoch, entry.aggregator) = (term, edge.clone());
+        entry.epoch = term;
+        entry.aggregator = edge.clone();
     }
     for mark in &mut share.marks {
-        (mark.epoch, mark.aggregator) = (term, edge.clone());
+        mark.epoch = term;
+        mark.aggregator = edge.clone();
     }
     signer.sign(share).expect("a key of the right kind")
 }

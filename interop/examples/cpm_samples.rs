@@ -34,7 +34,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "EMPTY",
     ];
     let objects = labels.iter().zip(0_u8..).map(|(label, index)| {
-        let (step, is_full) = (f64::from(index), index % 2 == 0);
+        let step = f64::from(index);
+        let is_full = index % 2 == 0;
         PerceivedObject {
             covariance_m2: is_full.then_some([0.04 + step, 0.01, 0.09]),
             velocity_mps: is_full.then_some([8.2 - step, -0.15]),

@@ -101,11 +101,9 @@ impl CpmBridge {
         })?;
         let described = Mutex::new((Instant::now(), Arc::new(described)));
         let numbers = Mutex::new(StationIds::new(name));
-        let (sightings, refusals, failures) = (
-            Mutex::default(),
-            RefusalCounts::default(),
-            Failures::default(),
-        );
+        let sightings = Mutex::default();
+        let refusals = RefusalCounts::default();
+        let failures = Failures::default();
         Ok(Self {
             cell,
             settings,
@@ -150,7 +148,8 @@ impl CpmBridge {
             let map: &GlobalMap = &*map?;
             let number = lock(&self.numbers).of(&map.aggregator, Instant::now());
             let Some(number) = number else { continue };
-            let (described, now) = (self.described(), Instant::now());
+            let described = self.described();
+            let now = Instant::now();
             let sightings = lock(&self.sightings);
             let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| {
                 sightings.is_sighted(at, now)
@@ -307,7 +306,8 @@ struct Station {
 
 impl Stations<'_> {
     fn report(&mut self, receiver: &NodeName, received: ReceivedCpm) -> Result<(), CpmRefusal> {
-        let (number, now) = (received.station_id, Instant::now());
+        let number = received.station_id;
+        let now = Instant::now();
         // Only a station with objects gets a place.
         if received.objects.is_empty() && !self.places.has(number) {
             return Ok(());

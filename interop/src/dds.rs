@@ -275,10 +275,8 @@ impl RosBridge {
         if let Some(topic) = &self.pose_topic {
             streams.push(self.read(topic, Taken::Pose)?);
         }
-        let (mut optics, mut poses) = (
-            None,
-            self.pose_topic.as_ref().map(|_| PoseHistory::default()),
-        );
+        let mut optics = None;
+        let mut poses = self.pose_topic.as_ref().map(|_| PoseHistory::default());
         for taken in block_on_stream(select_all(streams)) {
             let placed = match taken {
                 Taken::Patience => {

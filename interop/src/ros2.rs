@@ -250,7 +250,8 @@ mod tests {
             pose in option::of((up_to(1e8), up_to(1e8), -TAU..=TAU)),
             at in prop_oneof![Just(NOW.0), 0..(1u64 << 53)],
         ) {
-            let (edge, at) = (NodeName::from_static("edge"), Timestamp(at));
+            let edge = NodeName::from_static("edge");
+            let at = Timestamp(at);
             let fused = |(number, seen): (usize, &PerceivedObject)| FusedObject {
                 velocity_mps: seen.velocity_mps,
                 heading_rad: seen.heading_rad,

@@ -130,11 +130,9 @@ fn corners(figures: &mut Figures) -> anyhow::Result<()> {
 
 /// The corners of an upright target that is turned to the side.
 fn target(index: usize) -> [Point2<f64>; 4] {
-    let (left, top, side) = (
-        20.0 + (index % 500) as f64,
-        100.0 + (index % 37) as f64,
-        40.0 + (index % 50) as f64,
-    );
+    let left = 20.0 + (index % 500) as f64;
+    let top = 100.0 + (index % 37) as f64;
+    let side = 40.0 + (index % 50) as f64;
     [(0.0, 0.0), (0.9, 0.05), (0.9, 0.95), (0.0, 1.0)]
         .map(|(x, y)| Point2::new(left + x * side, top + y * side))
 }
@@ -170,7 +168,9 @@ fn time(
         times_ms.push(start.elapsed().as_secs_f64() * 1e3);
     }
     times_ms.sort_by(f64::total_cmp);
-    let (least, median, most) = (times_ms[0], times_ms[FRAMES / 2], times_ms[FRAMES - 1]);
+    let least = times_ms[0];
+    let median = times_ms[FRAMES / 2];
+    let most = times_ms[FRAMES - 1];
     println!("{name:<36} {least:>9.1} {median:>10.1} {most:>9.1} {found:>6}");
     figures.insert(
         name,

@@ -33,9 +33,12 @@ async fn main() {
             .and_then(|text| text.parse().ok())
             .unwrap_or(default)
     };
-    let (nodes, seconds): (u64, u64) = (number("NODES", 32), number("SECONDS", 10));
+    let nodes: u64 = number("NODES", 32);
+    let seconds: u64 = number("SECONDS", 10);
     let downs = Arc::<AtomicU64>::default();
-    let (mut seeds, mut counters, mut members) = (Vec::new(), Vec::new(), Vec::new());
+    let mut seeds = Vec::new();
+    let mut counters = Vec::new();
+    let mut members = Vec::new();
     for node in 0..nodes {
         let (sender, receiver) = watch::channel(Vec::<Member>::new());
         let counted = Arc::<FrameCounters>::default();
@@ -94,7 +97,9 @@ async fn main() {
             .sum::<u64>()
     };
     let counts = || [sum(FrameEvent::Sent), sum(FrameEvent::Received)];
-    let (before, processor, down) = (counts(), processor_time(), downs.load(Ordering::Relaxed));
+    let before = counts();
+    let processor = processor_time();
+    let down = downs.load(Ordering::Relaxed);
     tokio::time::sleep(Duration::from_secs(seconds)).await;
     let per_node = |n: f64| n / (nodes * seconds) as f64;
     let [sent, received] = std::array::from_fn(|at| per_node((counts()[at] - before[at]) as f64));

@@ -129,7 +129,8 @@ impl Demo<'_> {
     ) -> anyhow::Result<DemoResult> {
         let within = |time: Timestamp| from <= time && time <= until;
         let mut maps: BTreeMap<(Epoch, u64), GlobalMap> = BTreeMap::new();
-        let (mut ages, mut logs) = (Vec::new(), Vec::new());
+        let mut ages = Vec::new();
+        let mut logs = Vec::new();
         for cav in &self.scene.cavs {
             let mut log = stage.map_log(&cav.name)?;
             log.retain(|line| within(line.map.fused_at_us));

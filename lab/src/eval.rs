@@ -275,8 +275,12 @@ impl Tally {
         if self.lines == 0 && self.votes.is_empty() {
             return None;
         }
-        let (mut items, mut right, mut labelled, mut labelled_right) = (0, 0, 0, 0);
-        let (mut standing, mut covered) = (0, 0);
+        let mut items = 0;
+        let mut right = 0;
+        let mut labelled = 0;
+        let mut labelled_right = 0;
+        let mut standing = 0;
+        let mut covered = 0;
         let mut classes: BTreeMap<Option<Label>, (u64, u64)> = BTreeMap::new();
         let mut confusion: BTreeMap<(Option<Label>, Option<Label>), u64> = BTreeMap::new();
         for (id, number, span) in truth.spans() {

@@ -38,10 +38,8 @@ impl NodeProcess {
             .name
             .as_ref()
             .map_or_else(|| "node".to_owned(), ToString::to_string);
-        let (file, log) = (
-            directory.join(format!("{name}.toml")),
-            directory.join(format!("{name}.log")),
-        );
+        let file = directory.join(format!("{name}.toml"));
+        let log = directory.join(format!("{name}.log"));
         let text =
             toml::to_string(config).context("the configuration cannot be written as TOML")?;
         fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;

@@ -29,7 +29,8 @@ impl CellAccount {
     /// MQTT filters of the topics that the cell may publish.
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
-        let (tile, cell) = (*tile, cell.clone());
+        let tile = *tile;
+        let cell = cell.clone();
         let own = RegionTopicKind::ALL.map(|kind| RegionTopic {
             tile,
             cell: cell.clone(),
@@ -65,7 +66,8 @@ impl CellAccount {
                 .collect();
             subjects.join(", ")
         };
-        let (writes, reads) = (list(self.writes()), list(self.reads()));
+        let writes = list(self.writes());
+        let reads = list(self.reads());
         format!(
             "{{user: \"{}\", password: \"{password}\", permissions: {{\n  publish: {{allow: [{writes}]}},\n  \
              subscribe: {{allow: [{reads}]}}}}}}\n",

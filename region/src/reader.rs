@@ -141,7 +141,8 @@ async fn subscribe(
         let wanted: BTreeSet<_> = of_tiles
             .chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)])
             .collect();
-        let (new, old) = (&wanted - &present, &present - &wanted);
+        let new = &wanted - &present;
+        let old = &present - &wanted;
         for filter in old {
             // The next login subscribes anew if the connection has ended.
             let _ = client.unsubscribe(filter).await;

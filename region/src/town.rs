@@ -298,7 +298,8 @@ impl TownMap {
             mut objects,
             ..
         } = map;
-        let (area, told) = (CoveredArea::of(tile), objects.len());
+        let area = CoveredArea::of(tile);
+        let told = objects.len();
         objects.retain(|object| area.covers(&origin.to_wgs84(object.x_m, object.y_m, 0.0)));
         let covered = objects.len();
         objects.truncate(MAX_OBJECTS);
@@ -308,7 +309,8 @@ impl TownMap {
             too_many: (covered - objects.len()) as u64,
         };
         for object in &mut objects {
-            (object.contributors, object.scores) = (Vec::new(), BTreeMap::new());
+            object.contributors = Vec::new();
+            object.scores = BTreeMap::new();
         }
         objects.shrink_to_fit();
         (

@@ -20,10 +20,8 @@ const MAX_SENDERS: usize = 8192;
 impl RecentReports {
     /// Records a report; returns false if it arrived before.
     pub fn is_new(&mut self, kind: ReportKind, report: &ObjectReport) -> bool {
-        let (sender, mark) = (
-            (report.node.clone(), kind),
-            (report.captured_at_us, report.seq),
-        );
+        let sender = (report.node.clone(), kind);
+        let mark = (report.captured_at_us, report.seq);
         if self.0.len() >= MAX_SENDERS && !self.0.contains_key(&sender) {
             self.0.clear();
         }

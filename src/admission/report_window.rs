@@ -138,7 +138,8 @@ impl ReportWindow {
         let admitted = vehicle.admit(report, received_at, bounds, self.offset_before_us);
         match admitted {
             Ok(_) => {
-                (vehicle.candidate, vehicle.untimely_since) = (None, None);
+                vehicle.candidate = None;
+                vehicle.untimely_since = None;
                 vehicle.note_standing(report, received_at);
             }
             Err(RejectReason::Stale | RejectReason::FromTheFuture) => {

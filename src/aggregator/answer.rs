@@ -86,7 +86,8 @@ mod tests {
     }
 
     fn verdict(votes: &[(&str, f64)]) -> Verdict {
-        let (score, next) = (votes[0].1, votes.get(1).map_or(0.0, |(_, score)| *score));
+        let score = votes[0].1;
+        let next = votes.get(1).map_or(0.0, |(_, score)| *score);
         Verdict {
             landmark: "slot-0".into(),
             label: Some(votes[0].0.into()),

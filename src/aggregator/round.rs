@@ -107,7 +107,8 @@ impl Reporter {
 
     /// Begins a round at `now`; true if the round waits for it.
     fn begin_round(&mut self, now: Timestamp, period: Duration) -> bool {
-        let (silent, interval) = (now.since(self.last_report), self.interval(period));
+        let silent = now.since(self.last_report);
+        let interval = self.interval(period);
         let expected_within = interval.saturating_sub(silent);
         self.is_awaited = silent < interval * LIVE_INTERVALS
             && expected_within <= period + period / DELAY_DIVISOR;
@@ -225,7 +226,8 @@ impl RoundTrigger {
         // After a round that was held, another node may take over, or vehicles are still
         // connecting.
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
-        (self.missing, self.due) = (0, 0);
+        self.missing = 0;
+        self.due = 0;
         for live in &mut self.live {
             live.retain(|_, vehicle| {
                 now.since(vehicle.last_report) < REMEMBERED.max(period * LIVE_INTERVALS)
@@ -519,9 +521,8 @@ mod tests {
     fn a_round_that_is_held_lasts_its_period() {
         let start = Timestamp(1_000_000);
         let mut rounds = RoundTrigger::new(RoundConfig::default(), start);
-        let (euclid, at) = (NodeName::from_static("euclid"), |ms: u64| {
-            Timestamp(1_000_000 + ms * 1000)
-        });
+        let euclid = NodeName::from_static("euclid");
+        let at = |ms: u64| Timestamp(1_000_000 + ms * 1000);
         assert!(!rounds.report(ReportKind::Detections, &euclid, at(5)));
         rounds.hold();
         assert!(!rounds.tick(at(99)));

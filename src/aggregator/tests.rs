@@ -73,10 +73,8 @@ fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
         round,
         ..FusionConfig::default()
     });
-    let (mallory, euclid) = (
-        NodeName::from_static("mallory"),
-        NodeName::from_static("euclid"),
-    );
+    let mallory = NodeName::from_static("mallory");
+    let euclid = NodeName::from_static("euclid");
     let reporters = |cell: &mut Aggregator, rounds: std::ops::Range<u64>| {
         let mut last = BTreeSet::new();
         for round in rounds {
@@ -175,10 +173,8 @@ fn vehicles_that_are_expelled_one_after_the_other_leave_no_common_object() {
         },
         ..FusionConfig::default()
     });
-    let (mallory, watson) = (
-        NodeName::from_static("mallory"),
-        NodeName::from_static("watson"),
-    );
+    let mallory = NodeName::from_static("mallory");
+    let watson = NodeName::from_static("watson");
     let contributors = |cell: &mut Aggregator, rounds: std::ops::Range<u64>| {
         let mut last = Vec::new();
         for round in rounds {
@@ -233,7 +229,8 @@ fn a_round_is_closed_for_map_and_verdicts_together() {
             .unwrap();
         }
         let fused = cell.tick(now).unwrap();
-        let (map, verdicts) = (fused.map.clone().unwrap(), fused.verdicts.clone().unwrap());
+        let map = fused.map.clone().unwrap();
+        let verdicts = fused.verdicts.clone().unwrap();
         assert_eq!((map.epoch, map.round, map.fused_at_us), (7, round, now));
         assert_eq!(
             (verdicts.epoch, verdicts.round, verdicts.fused_at_us),
@@ -536,7 +533,8 @@ fn the_parts_of_a_vehicle_are_one_witness() {
         }
     }
     let fused = cell.tick(at(100)).unwrap();
-    let (map, verdicts) = (fused.map.unwrap(), fused.verdicts.unwrap());
+    let map = fused.map.unwrap();
+    let verdicts = fused.verdicts.unwrap();
     let verdict = &verdicts.verdicts[0];
     assert_eq!(
         verdict.contributors,

@@ -14,7 +14,8 @@ fn described(version: u64, text: &str) -> Arc<CellDescription> {
     hash.iter_mut()
         .zip(text.bytes())
         .for_each(|(hash, byte)| *hash = byte);
-    let (hash, set_by) = (ContentHash(hash), name("edge"));
+    let hash = ContentHash(hash);
+    let set_by = name("edge");
     Arc::new(CellDescription {
         schema: SCHEMA_VERSION,
         version,
@@ -113,7 +114,8 @@ fn one_candidate_that_is_no_operators_does_not_change_the_cell_and_two_pass_a_de
 
 #[test]
 fn a_node_without_a_description_gets_it_from_its_leader_while_the_operators_node_is_away() {
-    let (mut euclid, right) = (node("euclid"), described(6, "right"));
+    let mut euclid = node("euclid");
+    let right = described(6, "right");
     euclid.take(Arc::clone(&right), at(0));
     assert!(!adopts(&euclid.hear(
         &name("turing"),
@@ -491,10 +493,8 @@ fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
         DescriptionHistory::of(Some(described(1, "right"))),
     );
     for version in 2..40 {
-        let (liar, forged) = (
-            if version % 2 == 0 { "turing" } else { "euclid" },
-            described(version, "false"),
-        );
+        let liar = if version % 2 == 0 { "turing" } else { "euclid" };
+        let forged = described(version, "false");
         edge.hear(
             &name(liar),
             certified(liar, forged.stamp()),

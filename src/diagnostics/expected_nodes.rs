@@ -264,7 +264,8 @@ mod tests {
 
     #[test]
     fn an_operator_dismisses_a_missing_node_for_the_cell_until_it_returns() {
-        let (mut here, mut there) = (ExpectedNodes::default(), ExpectedNodes::default());
+        let mut here = ExpectedNodes::default();
+        let mut there = ExpectedNodes::default();
         check(
             &mut here,
             &[(EUCLID, Role::Auto), (GAUSS, Role::Cav)],

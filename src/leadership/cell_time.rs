@@ -145,7 +145,8 @@ impl CellTime {
             .rev()
             .max_by_key(|time| agree(*time))
             .unwrap_or_default();
-        let (is_cell_wrong, is_certain) = (time.abs() >= micros(MIN_CLOCK_JUMP), agree(time) > 1);
+        let is_cell_wrong = time.abs() >= micros(MIN_CLOCK_JUMP);
+        let is_certain = agree(time) > 1;
         let time = if is_cell_wrong && is_certain { time } else { 0 };
         let errors = errors
             .into_iter()
@@ -222,7 +223,8 @@ impl CellTime {
         }
         let offset = |time: Timestamp| time.micros_from(stamps.sent_us);
         peer.last = last;
-        (peer.wall_offset_us, peer.is_candidate) = (wall.map(offset), role != Role::Cav);
+        peer.wall_offset_us = wall.map(offset);
+        peer.is_candidate = role != Role::Cav;
         peer.cell_offset_us = stamps.cell_us.map(offset);
         if let Some(AnsweredStamps {
             sent_us,

@@ -399,7 +399,8 @@ impl Election {
             *found = (*found).max(*seen);
         }
         if *before == 0 || now.since(*since) >= TERM_WINDOW {
-            (*before, *since) = (*seen, now);
+            *before = *seen;
+            *since = now;
         }
         let has_own = self.terms.has_own();
         let stated = if has_own {

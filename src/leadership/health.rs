@@ -302,16 +302,14 @@ mod tests {
 
     #[test]
     fn a_leader_with_unusable_reports_settings_or_certificate_makes_way_if_another_could_lead() {
-        let (plane, brokers) = (
-            DataPlane {
-                external: None,
-                embedded: true,
-            },
-            Brokers {
-                own: Some(address(1)),
-                ..Brokers::default()
-            },
-        );
+        let plane = DataPlane {
+            external: None,
+            embedded: true,
+        };
+        let brokers = Brokers {
+            own: Some(address(1)),
+            ..Brokers::default()
+        };
         for fault in 0..3 {
             let mut monitor = monitor(Timestamp(60_000_000));
             let links = Some(BTreeMap::from([(address(1), LinkState::Up)]));

@@ -153,7 +153,8 @@ impl LedgerResync {
 
     /// Ends the leadership of this node.
     pub fn step_down(&mut self) {
-        (self.leads, self.lane) = (None, None);
+        self.leads = None;
+        self.lane = None;
     }
 
     /// The lane in which this node counts when it leads in `epoch`: the lane of its first epoch,
@@ -268,7 +269,8 @@ impl LedgerResync {
         let is_whole =
             taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
         if is_over || (self.is_signed && !is_whole) {
-            (taken.entries, taken.marks) = (Vec::new(), Vec::new());
+            taken.entries = Vec::new();
+            taken.marks = Vec::new();
         }
         // A candidate may claim to lead while the election names another leader. The true leader
         // repeats its evidence.
@@ -420,7 +422,8 @@ impl LedgerResync {
             .any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane))
         {
             // A leader that stopped and leads again may have lost its counts.
-            (self.wait, self.repeats) = (self.wait.max(1), REPEATS);
+            self.wait = self.wait.max(1);
+            self.repeats = REPEATS;
         }
         !judged.is_empty()
     }
@@ -496,8 +499,10 @@ impl LedgerResync {
         if leader.is_none() || leader == self.leader {
             return;
         }
-        (self.leader, self.shared) = (leader, ReputationLedger::default());
-        (self.wait, self.repeats) = (self.ticks_to_listen(candidates).max(1), REPEATS);
+        self.leader = leader;
+        self.shared = ReputationLedger::default();
+        self.wait = self.ticks_to_listen(candidates).max(1);
+        self.repeats = REPEATS;
         self.owes_everything =
             self.has_led || ledger.entries().any(|entry| entry.aggregator == self.name);
     }
@@ -519,7 +524,8 @@ impl LedgerResync {
         if !self.owes_everything || !is_due {
             return Vec::new();
         }
-        (self.owes_everything, self.everything_sent_at) = (false, Some(now));
+        self.owes_everything = false;
+        self.everything_sent_at = Some(now);
         let mut shares = self.everything(ledger, self.leader.as_ref());
         if shares.is_empty() && ledger.reset_at() > Timestamp::default() {
             // The news is the reset.
@@ -569,7 +575,8 @@ impl LedgerResync {
         if self.wait > 0 {
             return Vec::new();
         }
-        (self.wait, self.repeats) = (self.ticks_per_snapshot.max(1), self.repeats - 1);
+        self.wait = self.ticks_per_snapshot.max(1);
+        self.repeats -= 1;
         let is_told = |term: u64, aggregator: &NodeName| {
             let is_leaders = self
                 .leader

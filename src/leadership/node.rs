@@ -281,7 +281,8 @@ impl LeadershipNode {
                 round_period,
                 keeps_reputations,
             } => {
-                (self.round_period, self.keeps_reputations) = (round_period, keeps_reputations);
+                self.round_period = round_period;
+                self.keeps_reputations = keeps_reputations;
                 if self.status.description != description {
                     self.status.description = description;
                     self.is_status_told = false;
@@ -365,7 +366,8 @@ impl LeadershipNode {
     /// Passes a message to the election after limiting it to the sender's rights. A message that
     /// declares a higher role or priority is not dropped: the permitted part is still used.
     fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
-        let (from, declared) = (message.from.clone(), message.candidacy);
+        let from = message.from.clone();
+        let declared = message.candidacy;
         // Every follower vouches for its leader when it is asked; that counts only from a candidate.
         let vouches = matches!(message.body, Body::LeaderEvidence { .. });
         let limited = rights.limit(message);
@@ -556,7 +558,8 @@ impl LeadershipNode {
 
     fn update_health(&mut self, now: Timestamp) {
         let no_other = self.election.is_leading() && self.election.standby().is_none();
-        let (plane, brokers) = (self.links.plane(), self.links.brokers());
+        let plane = self.links.plane();
+        let brokers = self.links.brokers();
         let health = self
             .monitor
             .health(plane, brokers, no_other, self.round_period);
@@ -670,10 +673,8 @@ impl LeadershipNode {
         } else {
             NodeState::Following
         };
-        let (term, aggregator) = (
-            epoch.map_or(0, |epoch| epoch.term),
-            epoch.map(|epoch| &epoch.leader),
-        );
+        let term = epoch.map_or(0, |epoch| epoch.term);
+        let aggregator = epoch.map(|epoch| &epoch.leader);
         let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
         let told = (
             self.status.state,

@@ -149,11 +149,9 @@ mod tests {
             is_deserted: false,
             is_yielding: false,
         };
-        let (seeking, following, leading) = (
-            at(Position::Seeking),
-            at(Position::Following),
-            at(Position::Leading),
-        );
+        let seeking = at(Position::Seeking);
+        let following = at(Position::Following);
+        let leading = at(Position::Leading);
         assert_eq!(
             reason(&seeking, Some((4, 9)), true),
             (false, "no leader known".into())

@@ -293,7 +293,8 @@ mod tests {
 
     #[test]
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
-        let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
+        let mut filter = RoundFilter::new(0, ms(0));
+        let seeking = seeking();
         let mut take =
             |epoch, round, at| take(&mut filter, &map(epoch, round, ms(at)), ms(at), &seeking);
         assert_eq!(take(u64::MAX, 1, 0), Err(Refusal::NotElected));
@@ -306,7 +307,8 @@ mod tests {
 
     #[test]
     fn rounds_that_waited_while_the_node_was_stopped_are_not_taken() {
-        let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
+        let mut filter = RoundFilter::new(0, ms(0));
+        let seeking = seeking();
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
             assert_eq!(
@@ -327,7 +329,8 @@ mod tests {
 
     #[test]
     fn a_refused_map_does_not_make_old_ones_look_fresh() {
-        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
+        let mut filter = RoundFilter::new(0, ms(0));
+        let leadership = following(8, "edge");
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
             assert_eq!(
@@ -353,8 +356,9 @@ mod tests {
 
     #[test]
     fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
-        let (mut filter, seeking, now) =
-            (RoundFilter::new(0, Timestamp(1)), seeking(), Timestamp(1));
+        let mut filter = RoundFilter::new(0, Timestamp(1));
+        let seeking = seeking();
+        let now = Timestamp(1);
         let reputations = |epoch, round, aggregator: Option<&'static str>| Reputations {
             schema: SCHEMA_VERSION,
             aggregator: aggregator.map(NodeName::from_static),
@@ -389,7 +393,8 @@ mod tests {
 
     #[test]
     fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
-        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "euclid"));
+        let mut filter = RoundFilter::new(0, ms(0));
+        let leadership = following(8, "euclid");
         assert_eq!(
             take(&mut filter, &map(8, 1, ms(0)), ms(0), &leadership),
             Ok(())
@@ -402,7 +407,8 @@ mod tests {
 
     #[test]
     fn verdicts_are_signs_of_life_only_where_no_maps_come() {
-        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
+        let mut filter = RoundFilter::new(0, ms(0));
+        let leadership = following(8, "edge");
         let verdicts = |round: u64| Verdicts {
             schema: SCHEMA_VERSION,
             aggregator: NodeName::from_static("edge"),
@@ -456,7 +462,8 @@ mod tests {
 
     #[test]
     fn a_leader_that_proves_its_rounds_is_not_heard_without_proof() {
-        let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
+        let mut filter = RoundFilter::new(0, ms(0));
+        let leadership = following(8, "edge");
         let mut take = |epoch, round: u64, origin, leadership: &Leadership| {
             let at = ms(100 * round);
             filter

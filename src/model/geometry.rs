@@ -91,7 +91,8 @@ impl Covariance {
     /// Independent errors along and across a line of sight whose world direction is `bearing_rad`.
     pub fn along_bearing(bearing_rad: f64, along_m: f64, across_m: f64) -> Self {
         let (sin, cos) = bearing_rad.sin_cos();
-        let (along, across) = (along_m * along_m, across_m * across_m);
+        let along = along_m * along_m;
+        let across = across_m * across_m;
         Self {
             xx: cos * cos * along + sin * sin * across,
             xy: sin * cos * (along - across),
@@ -106,7 +107,8 @@ impl Covariance {
 
     /// True if all entries are finite and the matrix is positive semi-definite up to rounding.
     pub fn is_valid(&self) -> bool {
-        let (product, square) = (self.xx * self.yy, self.xy * self.xy);
+        let product = self.xx * self.yy;
+        let square = self.xy * self.xy;
         let finite = self.xx.is_finite() && self.yy.is_finite() && product.is_finite();
         finite && self.xx >= 0.0 && self.yy >= 0.0 && square <= product * (1.0 + ROUNDING)
     }
@@ -115,7 +117,8 @@ impl Covariance {
     /// deviation.
     pub fn mahalanobis_squared(&self, offset: &Vector2<f64>, floor_m: f64) -> f64 {
         let floor = floor_m * floor_m;
-        let (xx, yy) = (self.xx + floor, self.yy + floor);
+        let xx = self.xx + floor;
+        let yy = self.yy + floor;
         let determinant = xx * yy - self.xy * self.xy;
         (yy * offset.x * offset.x - 2.0 * self.xy * offset.x * offset.y + xx * offset.y * offset.y)
             / determinant
@@ -172,7 +175,8 @@ mod tests {
     #[test]
     fn rounding_makes_no_covariance_invalid_and_more_than_rounding_does() {
         for step in 1..1000 {
-            let (xx, yy) = (1e-6 * f64::from(step), 0.003 * f64::from(step) / 7.0);
+            let xx = 1e-6 * f64::from(step);
+            let yy = 0.003 * f64::from(step) / 7.0;
             let of = |correlation: f64| Covariance {
                 xx,
                 xy: correlation * (xx * yy).sqrt(),

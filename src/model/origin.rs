@@ -145,7 +145,8 @@ impl GeographicOrigin {
     /// The position on Earth of a position in the frame, `z_m` above the tangent plane.
     pub fn to_wgs84(&self, x_m: f64, y_m: f64, z_m: f64) -> GeographicPosition {
         let (sin, cos) = self.rotation_deg.to_radians().sin_cos();
-        let (east, north) = (x_m * cos - y_m * sin, x_m * sin + y_m * cos);
+        let east = x_m * cos - y_m * sin;
+        let north = x_m * sin + y_m * cos;
         let (latitude, longitude) = self.radians();
         let (latitude, longitude, height_m) = enu2geodetic(
             east,

@@ -137,7 +137,8 @@ impl Quadkey {
             let latitude = (PI * (1.0 - 2.0 * y / tiles)).sinh().atan();
             [latitude.to_degrees(), x / tiles * 360.0 - 180.0]
         };
-        let (x, y) = (f64::from(self.x), f64::from(self.y));
+        let x = f64::from(self.x);
+        let y = f64::from(self.y);
         [corner(x, y), corner(x + 1.0, y + 1.0)]
     }
 }

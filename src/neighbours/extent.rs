@@ -28,7 +28,9 @@ impl Extent {
     /// Processes the places in a map at `now`.
     pub(super) fn observe(&mut self, places: impl Iterator<Item = Point2<f64>>, now: Timestamp) {
         if now.since(self.span_start) >= Self::SPAN {
-            (self.previous, self.current, self.span_start) = (self.current.take(), None, now);
+            self.previous = self.current.take();
+            self.current = None;
+            self.span_start = now;
         }
         for place in places {
             let known = self.current.unwrap_or(Rectangle {

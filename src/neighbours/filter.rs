@@ -126,7 +126,8 @@ impl CellMapFilter {
             }
         }
         if received_at.since(self.looked_at) >= BACKLOG_PERIOD {
-            (self.backlog, self.looked_at) = (self.find_backlog(received_at), received_at);
+            self.backlog = self.find_backlog(received_at);
+            self.looked_at = received_at;
         }
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         let first = || CellOrder::new(epoch.clone(), received_at);
@@ -140,7 +141,9 @@ impl CellMapFilter {
         if epoch != order.epoch {
             order.by_sender = DelayEstimate::new(received_at);
         }
-        (order.epoch, order.round, order.received_at) = (epoch, map.round, received_at);
+        order.epoch = epoch;
+        order.round = map.round;
+        order.received_at = received_at;
         let ages = [
             (&mut order.by_sender, *sent_at_us),
             (&mut order.by_cell, map.fused_at_us),
@@ -189,7 +192,8 @@ impl CellMapFilter {
 
 impl CellOrder {
     fn new(epoch: Epoch, now: Timestamp) -> Self {
-        let (by_sender, by_cell) = (DelayEstimate::new(now), DelayEstimate::new(now));
+        let by_sender = DelayEstimate::new(now);
+        let by_cell = DelayEstimate::new(now);
         // Rounds begin with 1.
         Self {
             epoch,
@@ -230,7 +234,8 @@ impl DelayEstimate {
         self.least_long.observe(delay_us, now);
         let least_us = self.least.least();
         if least_us < self.usual_us.saturating_sub(JITTER_US) {
-            (self.usual_us, self.since) = (least_us, now);
+            self.usual_us = least_us;
+            self.since = now;
         }
         self.usual_us = self.usual_us.max(least_us);
         let beyond_us = delay_us.saturating_sub(least_us);

@@ -28,7 +28,8 @@ impl FrameChange {
     /// Puts an object of the neighbour, which is at `place`, into this cell's frame.
     pub(super) fn apply(&self, place: &GeographicPosition, object: &mut FusedObject) {
         let position: Point2<f64> = self.own.to_map(place).xy();
-        (object.x_m, object.y_m) = (position.x, position.y);
+        object.x_m = position.x;
+        object.y_m = position.y;
         object.velocity_mps = object
             .velocity_mps
             .map(|velocity| (self.rotation * Vector2::from(velocity)).into());

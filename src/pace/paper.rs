@@ -136,8 +136,9 @@ fn agree<'a>(
     near: impl ExactSizeIterator<Item = (&'a NodeName, &'a NearbyObject)> + Clone,
 ) -> LandmarkState {
     let count = near.len();
-    let (mut position_sum, mut confidence_sum, mut confidence_square_sum) =
-        (Vector2::zeros(), 0.0, 0.0);
+    let mut position_sum = Vector2::zeros();
+    let mut confidence_sum = 0.0;
+    let mut confidence_square_sum = 0.0;
     // A separate pass: its loads, which take most of the time, do not wait for each other.
     for (
         _,

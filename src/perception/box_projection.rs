@@ -54,7 +54,8 @@ impl BoxProjector {
         let distortion = distortion::from_first(&camera.distortion);
         let projection = Projection::new(self.config_of(camera), intrinsics, mount);
         let camera_pose = (*pose).into();
-        let (mut objects, mut unplaced) = (Vec::new(), Vec::new());
+        let mut objects = Vec::new();
+        let mut unplaced = Vec::new();
         for (index, found) in report.boxes.iter().enumerate() {
             let mut detection = Detection {
                 label: found.label.clone(),
@@ -114,7 +115,8 @@ impl BoxProjector {
 
 /// The intrinsics of a calibration, or else of the field of view.
 fn intrinsics_of(camera: &BoxCamera) -> Intrinsics {
-    let (width, height) = (camera.width_px, camera.height_px);
+    let width = camera.width_px;
+    let height = camera.height_px;
     if let (Some(fx), Some(fy), Some(cx), Some(cy)) = (camera.fx, camera.fy, camera.cx, camera.cy) {
         return Intrinsics {
             width,
@@ -196,13 +198,11 @@ mod tests {
 
     /// The pixel at which the camera of [`report`] shows a point `up_m` above the ground.
     fn pixel(report: &BoxReport, x_m: f64, y_m: f64, up_m: f64) -> Point2<f64> {
-        let (pose, mount) = (
-            Pose::from(report.pose),
-            Mount {
-                pitch_rad: report.pose.pitch_rad.unwrap(),
-                ..Mount::default()
-            },
-        );
+        let pose = Pose::from(report.pose);
+        let mount = Mount {
+            pitch_rad: report.pose.pitch_rad.unwrap(),
+            ..Mount::default()
+        };
         let level = pose
             .ahead_left(&Point2::new(x_m, y_m))
             .push(up_m - report.pose.height_m.unwrap());
@@ -214,10 +214,8 @@ mod tests {
     /// The box of a person of usual size who stands at a place south of the camera.
     fn person(x_m: f64, y_m: f64) -> PixelBox {
         let camera = report(Vec::new());
-        let (foot, head) = (
-            pixel(&camera, x_m + 0.25, y_m, 0.0),
-            pixel(&camera, x_m - 0.25, y_m, 1.7),
-        );
+        let foot = pixel(&camera, x_m + 0.25, y_m, 0.0);
+        let head = pixel(&camera, x_m - 0.25, y_m, 1.7);
         found("person", [foot.x, head.y, head.x, foot.y])
     }
 

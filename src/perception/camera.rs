@@ -36,7 +36,8 @@ impl Intrinsics {
         horizontal_rad: f64,
         vertical_rad: f64,
     ) -> Self {
-        let (half_width, half_height) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
+        let half_width = f64::from(width) / 2.0;
+        let half_height = f64::from(height) / 2.0;
         Self {
             width,
             height,
@@ -132,7 +133,8 @@ impl Mount {
     /// level axis without a configured height is the default and is not stated.
     pub fn stated_pose(&self, camera: &Pose) -> WirePose {
         let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
-        let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));
+        let pitch_rad = known(self.pitch_rad);
+        let roll_rad = known(self.roll_rad);
         WirePose {
             height_m: self.height_m,
             pitch_rad,
@@ -168,8 +170,8 @@ impl Mount {
 
     /// The rotation from the camera frame to the level frame.
     pub fn to_level(&self) -> Matrix3<f64> {
-        let ((sin_pitch, cos_pitch), (sin_roll, cos_roll)) =
-            (self.pitch_rad.sin_cos(), self.roll_rad.sin_cos());
+        let (sin_pitch, cos_pitch) = self.pitch_rad.sin_cos();
+        let (sin_roll, cos_roll) = self.roll_rad.sin_cos();
         Matrix3::new(
             -sin_roll * sin_pitch,
             -cos_roll * sin_pitch,

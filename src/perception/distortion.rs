@@ -28,7 +28,8 @@ const PRECISION: f64 = 1e-10;
 /// edges.
 pub fn undistort(detection: &mut Detection, intrinsics: &Intrinsics, distortion: &Distortion) {
     let straight = |x, y| undistorted(&Point2::new(x, y), intrinsics, distortion);
-    let (bounds, middle) = (detection.bounding_box, detection.bounding_box.center());
+    let bounds = detection.bounding_box;
+    let middle = detection.bounding_box.center();
     detection.bounding_box = BoundingBox {
         x_min: straight(bounds.x_min, middle.y).x,
         y_min: straight(middle.x, bounds.y_min).y,
@@ -55,7 +56,8 @@ pub fn undistorted(
     let bent = Point2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy);
     let mut ideal = bent;
     for _ in 0..MAX_STEPS {
-        let (x, y) = (ideal.x, ideal.y);
+        let x = ideal.x;
+        let y = ideal.y;
         let r2 = x * x + y * y;
         let polynomial = |a, b, c| 1.0 + r2 * (a + r2 * (b + r2 * c));
         let radial = polynomial(k1, k2, k3) / polynomial(k4, k5, k6);

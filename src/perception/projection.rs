@@ -121,10 +121,8 @@ impl Projection {
             return Cut::default();
         }
         let bounds = &detection.bounding_box;
-        let (width, height) = (
-            f64::from(self.intrinsics.width),
-            f64::from(self.intrinsics.height),
-        );
+        let width = f64::from(self.intrinsics.width);
+        let height = f64::from(self.intrinsics.height);
         Cut {
             upper: bounds.y_min < EDGE_PX,
             lower: bounds.y_max > height - EDGE_PX,
@@ -147,7 +145,8 @@ impl Projection {
         target: Option<&Point3<f64>>,
         camera: &Pose,
     ) -> Result<PerceivedObject, ProjectionError> {
-        let (label, bounds) = (&detection.label, &detection.bounding_box);
+        let label = &detection.label;
+        let bounds = &detection.bounding_box;
         if !bounds.is_valid() {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
@@ -174,7 +173,8 @@ impl Projection {
         cut: Cut,
         target: Option<&Point3<f64>>,
     ) -> Result<LineOfSight, ProjectionError> {
-        let (label, bounds) = (&detection.label, &detection.bounding_box);
+        let label = &detection.label;
+        let bounds = &detection.bounding_box;
         let known = self.config.sizes.of(label);
         let size = known.ok_or_else(|| ProjectionError::UnknownSize(label.clone()));
         let whole = |is_cut| {

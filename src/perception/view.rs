@@ -172,10 +172,8 @@ fn is_readable(landmark: &Landmark, camera: &PosedCamera, widths: &Widths) -> bo
     let [Some(left), Some(right)] = ends else {
         return false;
     };
-    let (width, height) = (
-        f64::from(camera.intrinsics.width),
-        f64::from(camera.intrinsics.height),
-    );
+    let width = f64::from(camera.intrinsics.width);
+    let height = f64::from(camera.intrinsics.height);
     let is_on_rows = |end: &Point2<f64>| (0.0..=height).contains(&end.y);
     right.x - left.x >= config.min_target_px
         && left.x >= config.margin_px
@@ -335,7 +333,8 @@ mod tests {
 
     #[test]
     fn places_are_judged_by_the_sizes_that_are_listed() {
-        let (slot, car) = (landmark("slot", 8.0, 0.0, None), ObjectSize::square(1.8));
+        let slot = landmark("slot", 8.0, 0.0, None);
+        let car = ObjectSize::square(1.8);
         let sizes = ObjectSizes {
             labels: [("car".into(), car)].into(),
             ..ObjectSizes::default()

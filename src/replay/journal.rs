@@ -95,7 +95,9 @@ impl JournalReplay {
 
     /// Begins another run of the node with this configuration; `fusion` is taken as valid.
     pub fn restart(&mut self, fusion: FusionConfig, landmarks: Vec<Landmark>) {
-        (self.fusion, self.landmarks, self.aggregator) = (fusion, landmarks, None);
+        self.fusion = fusion;
+        self.landmarks = landmarks;
+        self.aggregator = None;
     }
 
     /// Processes the next entry.

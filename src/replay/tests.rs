@@ -479,7 +479,8 @@ fn live(
         output.extend(map.map(FusedLine::Map));
         output.extend(verdicts.map(FusedLine::Verdicts));
     };
-    let (mut pending, mut first) = (false, Some(reports[0].2));
+    let mut pending = false;
+    let mut first = Some(reports[0].2);
     for (kind, report, received_at) in reports {
         if let Some(first) = first.take_if(|first| *first < *received_at) {
             publish(cell.close_early(first));
@@ -684,7 +685,8 @@ fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_sta
             .map(|(n, id)| LandmarkConfig::at(*id, 5.0 * n as f64, 0.0))
             .collect()
     };
-    let (before, after) = (places(&["slot-0"]), places(&["slot-1", "slot-0", "slot-2"]));
+    let before = places(&["slot-0"]);
+    let after = places(&["slot-1", "slot-0", "slot-2"]);
     let known = |places: &[LandmarkConfig]| places.iter().map(Landmark::from).collect::<Vec<_>>();
     let fusion = FusionConfig::default();
     let mut changed = fusion.clone();
@@ -692,7 +694,8 @@ fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_sta
     let start = reports[0].2;
     let mut live = Aggregator::new_standby(fusion.clone(), known(&before), start);
     let mut journal = JournalReplay::new(fusion, known(&before));
-    let (mut made, mut again) = (Vec::new(), Vec::new());
+    let mut made = Vec::new();
+    let mut again = Vec::new();
     let begin = |at_us| JournalEntry {
         at_us,
         event: JournalEvent::Start {
@@ -712,7 +715,8 @@ fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_sta
         landmarks: after.clone(),
     };
     for (index, (kind, report, at)) in reports.iter().enumerate() {
-        let (report, at) = (Arc::new(report.clone()), *at);
+        let report = Arc::new(report.clone());
+        let at = *at;
         if index == reports.len() * 3 / 4 {
             // The aggregator is restarted under the settings valid at that time.
             live = Aggregator::new_standby(changed.clone(), known(&after), at);

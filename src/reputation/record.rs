@@ -19,7 +19,8 @@ impl Record {
     /// (correct, incorrect) among the at most `room` latest votes that remain after the very latest
     /// `skip` votes.
     pub(super) fn latest(&self, (mut skip, mut room): (f64, f64)) -> (f64, f64) {
-        let (mut correct, mut incorrect) = (0.0, 0.0);
+        let mut correct = 0.0;
+        let mut incorrect = 0.0;
         let mut end = self.sum;
         let begins = self
             .marks

@@ -77,7 +77,8 @@ fn partitions_that_counted_apart_merge_to_their_sum() {
     };
     let mut common = ReputationLedger::default();
     common.record(1, &name("edge"), &evidence);
-    let (mut left, mut right) = (common.clone(), common);
+    let mut left = common.clone();
+    let mut right = common;
     left.record(2, &name("left"), &evidence);
     right.record(2, &name("right"), &evidence);
     left.merge(&right);

@@ -384,7 +384,8 @@ fn greedy_if_large(size: ClusterSize, cluster: &[GatedPair]) -> Option<Vec<Gated
     (size.rows > MAX_CLUSTER).then(|| {
         let mut by_benefit = cluster.to_vec();
         by_benefit.sort_by(|a, b| b.benefit.total_cmp(&a.benefit));
-        let (mut detections, mut hypotheses) = (HashSet::new(), HashSet::new());
+        let mut detections = HashSet::new();
+        let mut hypotheses = HashSet::new();
         by_benefit.retain(|pair| {
             let is_free =
                 !detections.contains(&pair.detection) && !hypotheses.contains(&pair.hypothesis);

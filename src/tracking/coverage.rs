@@ -65,7 +65,8 @@ impl Coverage {
             .centre
             .is_some_and(|before| (here - before).norm() > Self::JUMP_M);
         if has_jumped {
-            (self.farthest_m, self.directions) = (0.0, [0.0; Self::DIRECTIONS]);
+            self.farthest_m = 0.0;
+            self.directions = [0.0; Self::DIRECTIONS];
         }
         let centre = match self.centre {
             Some(before) if self.pose.is_none() && !has_jumped => before + (here - before) * 0.2,

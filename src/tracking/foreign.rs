@@ -243,7 +243,8 @@ impl ForeignObjects {
             };
             if is_theirs && track.renames < MAX_RENAMES && ids.insert(object.track.id) {
                 ids.remove(&id);
-                (track.id, track.renames) = (object.track.id, track.renames + 1);
+                track.id = object.track.id;
+                track.renames += 1;
                 track.first_seen = track.first_seen.min(object.track.first_seen);
                 object.same = Some((track.id, since));
                 self.hand_overs.renamed += 1;

@@ -24,7 +24,8 @@ pub(super) struct Gauge {
 impl Gauge {
     /// Puts two observers into one group.
     pub(super) fn join(&mut self, one: SensorId, other: SensorId) {
-        let (one, other) = (self.group(one.number()), self.group(other.number()));
+        let one = self.group(one.number());
+        let other = self.group(other.number());
         self.towards[one] = other;
     }
 
@@ -46,13 +47,15 @@ impl Gauge {
         };
         let mut kept = vec![(0.0, 0.0); known];
         for sensor in observers() {
-            let (group, weight) = (self.group(sensor.id.number()), weight(sensor));
+            let group = self.group(sensor.id.number());
+            let weight = weight(sensor);
             let (_, of_sensor) = before(&self.before, sensor);
             kept[group] = (kept[group].0 + weight * of_sensor, kept[group].1 + weight);
         }
         let mut sums = vec![MotionSums::default(); known];
         for sensor in observers() {
-            let (group, pose_bias) = (self.group(sensor.id.number()), &sensor.pose_bias);
+            let group = self.group(sensor.id.number());
+            let pose_bias = &sensor.pose_bias;
             let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
             let (error, _) = before(&self.before, sensor);
             sums[group].add(

@@ -68,14 +68,10 @@ impl TrackGrid {
         reach_m: f64,
         mut visit: impl FnMut(&IndexedTrack),
     ) {
-        let (west, east) = (
-            self.line(position.x - reach_m),
-            self.line(position.x + reach_m),
-        );
-        let (south, north) = (
-            self.line(position.y - reach_m),
-            self.line(position.y + reach_m),
-        );
+        let west = self.line(position.x - reach_m);
+        let east = self.line(position.x + reach_m);
+        let south = self.line(position.y - reach_m);
+        let north = self.line(position.y + reach_m);
         for column in west..=east {
             for row in south..=north {
                 let tracks = self

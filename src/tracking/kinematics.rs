@@ -97,7 +97,8 @@ impl KinematicState {
 
     /// Moves the state to `at`; an earlier time changes nothing.
     pub(super) fn predict(&mut self, at: Timestamp) {
-        let (dt, density) = (self.seconds_to(at), self.class.acceleration_density());
+        let dt = self.seconds_to(at);
+        let density = self.class.acceleration_density();
         if dt <= 0.0 {
             return;
         }
@@ -207,7 +208,8 @@ impl KinematicState {
 
     /// Limits the speed to the maximum of the class.
     pub(super) fn limit_speed(&mut self) {
-        let (speed, max_mps) = (self.velocity.norm(), self.class.max_speed_mps);
+        let speed = self.velocity.norm();
+        let max_mps = self.class.max_speed_mps;
         if speed > max_mps {
             self.velocity *= max_mps / speed;
         }

@@ -40,7 +40,8 @@ impl OcclusionMap {
             return;
         }
         let aside = Vector2::new(-offset.y, offset.x) * (Self::HALF_WIDTH_M / distance_m);
-        let (first, last) = (Self::ray(&(offset - aside)), Self::ray(&(offset + aside)));
+        let first = Self::ray(&(offset - aside));
+        let last = Self::ray(&(offset + aside));
         let count = (last + Self::RAYS - first) % Self::RAYS + 1;
         for ray in (first..first + count).map(|ray| ray % Self::RAYS) {
             self.sight_m[ray] = self.sight_m[ray].min(distance_m as f32);

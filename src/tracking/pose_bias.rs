@@ -127,7 +127,9 @@ impl PoseBias {
 
     /// A function that corrects reported positions.
     pub(super) fn corrector(&self) -> impl Fn(&Vector2<f64>) -> Vector2<f64> + use<> {
-        let (pivot, rotation, offset) = (self.pivot, self.rotation(), self.error.xy());
+        let pivot = self.pivot;
+        let rotation = self.rotation();
+        let offset = self.error.xy();
         move |reported| pivot + rotation * (reported - pivot) + offset
     }
 
@@ -151,7 +153,8 @@ impl PoseBias {
     /// likelihood ratio, linear hypotheses on normal location parameters", 1971). An estimate of little more than noise
     /// would move reports that were captured together apart.
     pub(super) fn delay_s(&self, prior: &BiasPrior) -> f64 {
-        let (before, after) = (prior.delay_s * prior.delay_s, self.covariance.m44);
+        let before = prior.delay_s * prior.delay_s;
+        let after = self.covariance.m44;
         let is_delayed = self.error.w * self.error.w > after * (before / after).ln();
         if is_delayed { self.error.w } else { 0.0 }
     }
@@ -189,7 +192,8 @@ impl PoseBias {
         let predicted = self.error;
         let mut counted = 0.0;
         for _ in 0..ITERATIONS {
-            let (rotation, offset) = (self.rotation(), self.error.xy());
+            let rotation = self.rotation();
+            let offset = self.error.xy();
             let mut normal = NormalEquations::default();
             counted = 0.0;
             for pair in pairs {
@@ -209,7 +213,8 @@ impl PoseBias {
                 );
                 counted += trust;
             }
-            let (information, gradient) = (normal.information(), normal.gradient());
+            let information = normal.information();
+            let gradient = normal.gradient();
             let Some(covariance) = (prior_information + information).try_inverse() else {
                 return;
             };

@@ -81,7 +81,9 @@ impl Correspondence {
     ) -> Option<Self> {
         let track = &tracks[sample.track];
         let velocity = track.state.velocity;
-        let (mut sum, mut weight, mut common) = (Vector2::zeros(), 0.0, 0.0);
+        let mut sum = Vector2::zeros();
+        let mut weight = 0.0;
+        let mut common = 0.0;
         for other in track
             .seen_by(frame.at - SIMULTANEOUS)
             .filter(|history| history.sensor != frame.sensor)

@@ -70,8 +70,10 @@ impl TrackStore {
             grid,
             ..
         } = Self::new(config);
-        (self.max_tracks, self.max_density, self.gate_m, self.grid) =
-            (max_tracks, max_density, gate_m, grid);
+        self.max_tracks = max_tracks;
+        self.max_density = max_density;
+        self.gate_m = gate_m;
+        self.grid = grid;
         self.reindex(self.indexed_at);
     }
 

@@ -121,7 +121,8 @@ fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden()
             .find(|object| object.y_m.abs() < 3.0)
             .cloned()
     };
-    let (seen, coasting) = (find(&before).unwrap(), find(&hidden).unwrap());
+    let seen = find(&before).unwrap();
+    let coasting = find(&hidden).unwrap();
     assert_eq!(seen.id, coasting.id);
     assert!(near(&coasting, 37.0, 0.0, 2.0), "{coasting:?}");
     assert!(coasting.confidence < seen.confidence);
@@ -501,7 +502,9 @@ fn offsets_and_rotations_of_poses_are_found_and_published() {
 
 #[test]
 fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_takes_them_over() {
-    let (mut leader, mut standby, mut newcomer) = (tracker(), tracker(), tracker());
+    let mut leader = tracker();
+    let mut standby = tracker();
+    let mut newcomer = tracker();
     let map = two_cars(&mut leader, 0..30, |_| true);
     assert_eq!(two_cars(&mut standby, 0..30, |_| true), map);
     let other = two_cars(&mut newcomer, 20..30, |_| true);
@@ -580,7 +583,8 @@ fn a_detector_with_low_confidences_is_understood_after_a_while() {
             .map(|n| PerceivedObject::new("car", rng.random_range(0.12..0.3), n as f64 * 10.0, 0.0))
             .collect();
         for _ in 0..5 {
-            let (x, y) = (rng.random_range(0.0..90.0), rng.random_range(10.0..60.0));
+            let x = rng.random_range(0.0..90.0);
+            let y = rng.random_range(10.0..60.0);
             objects.push(PerceivedObject::new(
                 "car",
                 rng.random_range(0.02..0.08),
@@ -660,7 +664,8 @@ proptest! {
         seed in any::<u64>(),
     ) {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let (mut straight, mut shuffled) = (tracker(), tracker());
+        let mut straight = tracker();
+        let mut shuffled = tracker();
         for (frame, reports) in rounds.into_iter().enumerate() {
             let frame = frame as u64;
             let mut reports: Vec<_> = reports

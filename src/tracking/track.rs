@@ -207,7 +207,9 @@ impl Track {
     ) -> f64 {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
         let looks = self.existence.log_odds_at(at, leaving_hz, is_detected);
-        let (mut confidences, mut denied, mut witnesses) = (0.0, 0.0, 0);
+        let mut confidences = 0.0;
+        let mut denied = 0.0;
+        let mut witnesses = 0;
         for history in self.history.iter() {
             let trust = trust(history.sensor);
             confidences += trust * history.shared_confidence_nats(at);

@@ -198,7 +198,8 @@ impl Tracker {
         );
         self.foreign
             .forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
-        let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
+        let mut objects = self.objects(now);
+        let mut pose_corrections = self.corrections();
         self.frame
             .restore(now, &mut objects, pose_corrections.values_mut());
         TracksRound {

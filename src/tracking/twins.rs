@@ -48,7 +48,9 @@ impl Twins {
         self.0.retain(|twin| now.since(twin.at) <= REMEMBERED);
         let known = self.0.iter().position(|twin| twin.id == other_id);
         let since = known.map_or(Timestamp::default(), |known| self.0[known].at);
-        let (mut nats, mut is_own_alone, mut is_other_alone) = (0.0, false, false);
+        let mut nats = 0.0;
+        let mut is_own_alone = false;
+        let mut is_other_alone = false;
         let mut at = since;
         for look in own.iter() {
             let Some(theirs) = other.get(look.sensor) else {

@@ -82,7 +82,8 @@ impl InstantUpdate<'_> {
         let mut scans = Vec::new();
         for (report, delay_s) in reports {
             let (sensor, fleet) = self.sensors.hear(&report.node, self.at, self.config);
-            let (id, trust) = (sensor.id, fleet.trust(sensor.id));
+            let id = sensor.id;
+            let trust = fleet.trust(sensor.id);
             let has_jumped = sensor.observe(report, self.at, self.config);
             if trust > 0.0 {
                 self.update_own_track(id, report);
@@ -354,7 +355,8 @@ impl InstantUpdate<'_> {
 
     /// Weighs all looks in the existences, then updates rates, calibrations and judgements by them.
     fn weigh(&mut self, looks: &[Look], scans: &[Scan<'_>], evidence: &mut Vec<Evidence>) {
-        let (at, leaving_hz) = (self.at, self.population.leaving_hz());
+        let at = self.at;
+        let leaving_hz = self.population.leaving_hz();
         let mut due = Vec::new();
         for (number, look) in looks.iter().enumerate() {
             let scan = &scans[look.scan];
@@ -463,14 +465,17 @@ impl InstantUpdate<'_> {
 
     /// Compares a vehicle's detections with the objects that other cells state, and judges these cells.
     fn look_at_foreign(&mut self, scan: &Scan<'_>) {
-        let (id, at, gate) = (scan.sensor, self.at, self.config.gate());
+        let id = scan.sensor;
+        let at = self.at;
+        let gate = self.config.gate();
         let Some(sensor) = self.sensors.get(id).filter(|_| !self.foreign.is_empty()) else {
             return;
         };
         let Some(centre) = sensor.coverage.centre() else {
             return;
         };
-        let (reach_m, near_m) = (sensor.coverage.range_m(), 2.0 * self.config.gate_m);
+        let reach_m = sensor.coverage.range_m();
+        let near_m = 2.0 * self.config.gate_m;
         let is_in_view = |place: &Vector2<f64>| sensor.coverage.rates_at(place).is_some();
         // Objects that nobody can see take no place from others.
         let is_looked_at = |place: &Vector2<f64>| {
@@ -514,7 +519,8 @@ impl InstantUpdate<'_> {
         index: usize,
         detected: Option<&PerceivedObject>,
     ) -> Track {
-        let (at, config) = (self.at, self.config);
+        let at = self.at;
+        let config = self.config;
         let fleet = &self.sensors.fleet;
         match self
             .foreign

@@ -152,10 +152,8 @@ impl ConfidenceCalibration {
             bands.votes[band] = (bands.votes[band] + self.live.votes[band]).max(0.0);
             bands.agreed[band] = (bands.agreed[band] + self.live.agreed[band]).max(0.0);
         }
-        let (agreed, votes) = (
-            bands.agreed.iter().sum::<f64>(),
-            bands.votes.iter().sum::<f64>(),
-        );
+        let agreed = bands.agreed.iter().sum::<f64>();
+        let votes = bands.votes.iter().sum::<f64>();
         let rate = (agreed + 0.7) / (votes + 1.0);
         let shrunk = |agreed: f64, votes: f64| {
             odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES))
@@ -298,7 +296,8 @@ mod tests {
                 (0, 0.4, true)
             }
         }));
-        let (high, low) = (weight(&calibration, 0, 0.9), weight(&calibration, 0, 0.4));
+        let high = weight(&calibration, 0, 0.9);
+        let low = weight(&calibration, 0, 0.4);
         assert!(
             (high - 1.0).abs() < 0.05 && (low - 1.0).abs() < 0.05,
             "{high} {low}"

@@ -147,7 +147,8 @@ mod tests {
 
     #[test]
     fn a_forgotten_label_leaves_the_rest_as_if_it_had_never_been() {
-        let (mut confusion, mut without) = (Confusion::default(), Confusion::default());
+        let mut confusion = Confusion::default();
+        let mut without = Confusion::default();
         for (truth, stated, weight) in [
             (0, 0, 4.0),
             (0, 1, 1.0),
@@ -166,7 +167,8 @@ mod tests {
 
     #[test]
     fn counts_fade_as_if_each_were_faded_however_long() {
-        let (mut confusion, mut expected) = (Confusion::default(), 0.0);
+        let mut confusion = Confusion::default();
+        let mut expected = 0.0;
         for step in 0..200_000u32 {
             confusion.fade(if step % 1000 == 0 { 0.1 } else { 0.998 });
             confusion.add((step % 2) as LabelIndex, [(0, 1.0)], 1.0);
@@ -177,7 +179,8 @@ mod tests {
             "{} {expected}",
             confusion.total()
         );
-        let (zero, one) = (confusion.stated(0), confusion.stated(1));
+        let zero = confusion.stated(0);
+        let one = confusion.stated(1);
         let both = zero.where_true(0) + one.where_true(0);
         assert!((both - zero.all_where_true(0)).abs() < 1e-9);
         assert!((zero.where_true(0) - confusion.correct()).abs() < 1e-9);

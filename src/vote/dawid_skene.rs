@@ -271,7 +271,8 @@ impl DawidSkene {
     pub(super) fn refresh(&mut self, vehicles: impl Iterator<Item = usize>) {
         self.shares.shrink(self.config.class_share_verdicts);
         self.class_weight = self.label_bias.class_weight();
-        let (fleet, prior) = (self.fleet_accuracy(), self.config.vehicle_prior_votes);
+        let fleet = self.fleet_accuracy();
+        let prior = self.config.vehicle_prior_votes;
         for vehicle in vehicles {
             let evidence = &mut self.vehicles[vehicle];
             let accuracy = (evidence.correct() + prior * fleet) / (evidence.votes() + prior);
@@ -324,7 +325,8 @@ impl DawidSkene {
     /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven
     /// vehicles'; 1 where no vehicle is proven.
     pub(super) fn newcomer_factor(&self, votes: &[WeightedVote]) -> f64 {
-        let (mut newcomers, mut proven) = (0.0, 0.0);
+        let mut newcomers = 0.0;
+        let mut proven = 0.0;
         for vote in votes {
             *(if self.is_newcomer(vote.vehicle) {
                 &mut newcomers

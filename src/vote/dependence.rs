@@ -127,7 +127,8 @@ impl Dependence {
 
     /// As [`Self::new`], for all stored votes together, without fading.
     pub(super) fn of_stored() -> Self {
-        let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);
+        let max_compared = MAX_COMPARED_STORED;
+        let significance = SIGNIFICANCE_STORED;
         Self {
             memory: f64::INFINITY,
             max_compared,
@@ -179,7 +180,8 @@ impl Dependence {
             let distance = 1 + (self.compared / votes.len() + step) % distances;
             let half_turn = 2 * distance == votes.len();
             for place in 0..if half_turn { distance } else { votes.len() } {
-                let (one, other) = (votes[place], votes[(place + distance) % votes.len()]);
+                let one = votes[place];
+                let other = votes[(place + distance) % votes.len()];
                 if one.is_new || other.is_new {
                     self.compare_pair(one, other);
                 }
@@ -212,7 +214,8 @@ impl Dependence {
         }
         if self.total >= SHARES_MEMORY {
             self.stated.iter_mut().for_each(|n| *n /= 2.0);
-            (self.total, self.squares) = (self.total / 2.0, self.squares / 4.0);
+            self.total /= 2.0;
+            self.squares /= 4.0;
         }
         self.squares += 2.0 * self.stated[label] + 1.0;
         self.stated[label] += 1.0;

@@ -194,11 +194,9 @@ impl LandmarkVotes {
             let independence = dependence.independence(vehicle, agrees);
             let band = calibration.band(vehicle, confidence);
             let vote = &mut self.votes[place];
-            (vote.independence, vote.band, vote.weight) = (
-                independence,
-                band,
-                weights.of(band, confidence) * visibility * recent.certainty(),
-            );
+            vote.independence = independence;
+            vote.band = band;
+            vote.weight = weights.of(band, confidence) * visibility * recent.certainty();
         }
     }
 

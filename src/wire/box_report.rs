@@ -199,7 +199,8 @@ impl BoxReport {
 
 impl BoxCamera {
     fn check(&self) -> Result<(), Flaw> {
-        let (width, height) = (f64::from(self.width_px), f64::from(self.height_px));
+        let width = f64::from(self.width_px);
+        let height = f64::from(self.height_px);
         for (field, value, low, high) in [
             ("camera.width_px", Some(width), 16.0, 16_384.0),
             ("camera.height_px", Some(height), 16.0, 16_384.0),
@@ -293,7 +294,8 @@ impl PixelBox {
             let fault = format!("has no area: [{x_min}, {y_min}, {x_max}, {y_max}]");
             return Err(flaw("", RejectReason::OutOfRange, fault));
         }
-        let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
+        let width = f64::from(camera.width_px);
+        let height = f64::from(camera.height_px);
         let is_inside = |low: f64, high: f64, size: f64| {
             low >= -size * MAX_OVERHANG && high <= size * (1.0 + MAX_OVERHANG)
         };

@@ -214,7 +214,8 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
         context: &mut C,
     ) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
         let count = d.map()?;
-        let (mut values, mut read) = (BTreeMap::new(), 0);
+        let mut values = BTreeMap::new();
+        let mut read = 0;
         while has_more(d, count, read)? {
             values.insert(d.str()?.into(), F::decode(d, context)?);
             read += 1;

@@ -54,7 +54,8 @@ impl Member {
         adjust: impl FnOnce(&mut MembershipArguments),
     ) -> Self {
         let events = Arc::<Mutex<Vec<_>>>::default();
-        let (sink, counters) = (Arc::clone(&events), Arc::<FrameCounters>::default());
+        let sink = Arc::clone(&events);
+        let counters = Arc::<FrameCounters>::default();
         let (sender, members) = watch::channel(Vec::new());
         let mut arguments = MembershipArguments {
             name: name(node),

@@ -194,7 +194,8 @@ proptest! {
         fusion.vote.mode = mode;
         let listed = if is_open { Vec::new() } else { places() };
         let mut cell = Aggregator::new(NodeName::from_static("edge"), 7, fusion, listed, at(0));
-        let (mut rounds, mut has_honest) = (0, false);
+        let mut rounds = 0;
+        let mut has_honest = false;
         for round in 1..=20 {
             let now = at(round * 100);
             let mut closed = Vec::new();
@@ -266,7 +267,9 @@ proptest! {
         let node = NodeName::new("x".repeat(64)).unwrap();
         let mut status = NodeStatus::starting(node.clone(), Uuid::nil(), Role::Edge, "0.1.0");
         status.troubles = register.present(at(1));
-        (status.epoch, status.aggregator, status.page) = (MAX_INTEGER, Some(node), Some("[2001:db8::ffff:ffff]:65535".into()));
+        status.epoch = MAX_INTEGER;
+        status.aggregator = Some(node);
+        status.page = Some("[2001:db8::ffff:ffff]:65535".into());
         status.description = Some(DescriptionStatus {
             version: MAX_INTEGER,
             hash: ContentHash::default(),

@@ -154,7 +154,8 @@ fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
 #[test]
 fn a_standby_leads_on_with_the_same_identities() {
     let open = || Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(START));
-    let (mut leader, mut standby) = (open(), open());
+    let mut leader = open();
+    let mut standby = open();
     leader.lead(
         Epoch::new(1, NodeName::from_static("edge")),
         1,
@@ -313,10 +314,8 @@ fn dragged_by(shift_m: f64, stated_sigma_m: f64, has_pose: bool) -> f64 {
             .collect();
         assert!(shifts.len() >= late.len(), "an object is missing");
         let mean = |sum: f64| sum / shifts.len() as f64;
-        let (dx_m, dy_m) = (
-            mean(shifts.iter().map(|shift| shift.0).sum()),
-            mean(shifts.iter().map(|shift| shift.1).sum()),
-        );
+        let dx_m = mean(shifts.iter().map(|shift| shift.0).sum());
+        let dy_m = mean(shifts.iter().map(|shift| shift.1).sum());
         dx_m.hypot(dy_m)
     };
     places.into_iter().map(drag).fold(0.0, f64::max)
@@ -363,7 +362,8 @@ fn what_one_invents_at_a_known_location_is_no_fact_where_four_look() {
             landmarks,
             Timestamp(START),
         );
-        let (mut maps, mut believed) = (0, 0);
+        let mut maps = 0;
+        let mut believed = 0;
         for frame in 1..=200 {
             let at = Timestamp(START + frame * 100_000);
             let mut fused = Vec::new();

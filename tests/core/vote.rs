@@ -445,7 +445,8 @@ fn who_was_there_first_does_not_outvote_several_that_come_later() {
         let truth = |place: usize| if place < rare { "van" } else { "car" };
         let names: Vec<String> = (0..12).map(|place| format!("slot-{place}")).collect();
         let mut vote = Vote::new(VoteConfig::default(), Vec::new());
-        let (mut wrong, mut refuted) = ([0; 8], BTreeMap::<NodeName, i64>::new());
+        let mut wrong = [0; 8];
+        let mut refuted = BTreeMap::<NodeName, i64>::new();
         for frame in 0..1100 {
             let at = START + Duration::from_millis(100 * frame);
             let honest = (frame.saturating_sub(200) / 100).min(7) as usize;
@@ -693,7 +694,8 @@ proptest! {
         let forward: Vec<_> = votes.clone().into_iter().collect();
         let mut turned = forward.clone();
         turned.rotate_left((seed % forward.len() as u64) as usize);
-        let (a, b) = (run(forward), run(turned));
+        let a = run(forward);
+        let b = run(turned);
         prop_assert_eq!(a.len(), b.len());
         for (a, b) in a.iter().zip(&b) {
             let label = a.label.as_ref().unwrap();

@@ -111,7 +111,8 @@ fn handing_back_misses_and_repeats_no_round() {
                 !world.nodes[0].leads(),
                 "the edge leads before it is stable",
             )?;
-            let (from, changes) = (world.now, world.led.len());
+            let from = world.now;
+            let changes = world.led.len();
             world.run_for(4 * SECOND);
             ensure(world.leaders() == [0], "the edge was not handed the lead")?;
             ensure(
@@ -184,7 +185,8 @@ fn a_one_way_link_does_not_flap() {
         check(&mut world, seed, |world| {
             world.run_for(8 * SECOND);
             let before = world.led.len();
-            let (from, to) = (world.random.index(nodes), world.random.index(nodes));
+            let from = world.random.index(nodes);
+            let to = world.random.index(nodes);
             if from != to {
                 world.plan(0, Fault::Cut { from, to });
             }
@@ -472,7 +474,8 @@ fn plan_fault(world: &mut World, nodes: usize) {
         }
         5 => {
             for _ in 0..world.random.between(1, 4) {
-                let (from, to) = (world.random.index(nodes), world.random.index(nodes));
+                let from = world.random.index(nodes);
+                let to = world.random.index(nodes);
                 world.plan(at, Fault::Cut { from, to });
             }
         }
@@ -539,7 +542,8 @@ fn end_faults(world: &mut World) {
 }
 
 fn one_best_leader(world: &World) -> Result<(), String> {
-    let (best, leaders) = (world.best(), world.leaders());
+    let best = world.best();
+    let leaders = world.leaders();
     if best.is_empty() {
         return Ok(());
     }

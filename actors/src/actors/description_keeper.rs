@@ -147,10 +147,8 @@ impl Actor for DescriptionKeeper {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let (now, is_tick) = (
-            clock::now(),
-            matches!(message, DescriptionKeeperMessage::Tick),
-        );
+        let now = clock::now();
+        let is_tick = matches!(message, DescriptionKeeperMessage::Tick);
         if state.leadership.has_changed().unwrap_or(false) {
             let leadership = state.leadership.borrow_and_update().clone();
             let effects = state.exchange.lead(leadership.leader(), now);
@@ -278,7 +276,8 @@ impl DescriptionKeeperState {
                     description,
                     stated_by,
                 } => {
-                    let (stamp, set_by) = (description.stamp(), &description.set_by);
+                    let stamp = description.stamp();
+                    let set_by = &description.set_by;
                     tracing::info!(%stamp, %set_by, %stated_by, "the cell has a new description");
                     self.writer.note_change();
                     (self.apply)(description);

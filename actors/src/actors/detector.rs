@@ -170,8 +170,10 @@ impl Actor for Detector {
         let Some(mut detect) = state.detect.take() else {
             return Err("the detector was lost".into());
         };
-        let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
-        let (mut images, lens) = (state.images.take(), state.lens);
+        let captured_at = frame.captured_at;
+        let size = ImageSize::of(&frame.image);
+        let mut images = state.images.take();
+        let lens = state.lens;
         let span = tracing::info_span!("detect");
         let (detect, images, frame, outcome, took) = spawn_blocking(move || {
             let begun = Instant::now();
@@ -184,7 +186,8 @@ impl Actor for Detector {
             (detect, images, frame, outcome, took)
         })
         .await?;
-        (state.detect, state.images) = (Some(detect), images);
+        state.detect = Some(detect);
+        state.images = images;
         state.record_duration(took);
         match outcome {
             Ok(mut detections) => {
@@ -263,7 +266,9 @@ async fn pump(
 ) {
     let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
-    let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
+    let mut skipped = 0;
+    let mut unusable = 0;
+    let mut failures = 0;
     loop {
         let mut ready = pin!(Arc::clone(&permits).acquire_owned());
         let permit = loop {
@@ -382,7 +387,8 @@ mod tests {
 
     #[tokio::test]
     async fn a_detector_whose_reports_come_too_late_is_slow_by_its_measured_time() {
-        let (counters, frame_ms) = (Arc::<Counters>::default(), Arc::new(AtomicU64::new(300)));
+        let counters = Arc::<Counters>::default();
+        let frame_ms = Arc::new(AtomicU64::new(300));
         let detector = arguments(Steady(Arc::clone(&frame_ms)), &counters);
         let (detector, ended) = Actor::spawn(None, Detector, detector).await.unwrap();
         let cause = || {

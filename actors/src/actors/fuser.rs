@@ -371,7 +371,8 @@ impl FuserState {
         let Some(id) = next.and_then(|place| named.nth(place)) else {
             return;
         };
-        let (node, troubles) = (report.node.as_str(), self.counters.troubles());
+        let node = report.node.as_str();
+        let troubles = self.counters.troubles();
         match self.aggregator.knows_location(id) {
             Some(true) => {}
             Some(false) => {

@@ -255,7 +255,8 @@ impl GatewayState {
         // Each run has its own client id. With a shared id, a broker would end the old connection
         // before it accepts the new one, so that the last will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
-        let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
+        let will = Mutex::new(will);
+        let inbox = Arc::new(inbox);
         let sink = Arc::<Inbox>::clone(&inbox);
         let unreachable = TroubleKind::BrokerUnreachable;
         let setup = LinkSetup {
@@ -369,7 +370,8 @@ impl GatewayState {
     }
 
     fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
-        let (path, mut payload) = (self.topics.path(topic), encode(payload, self.encoding));
+        let path = self.topics.path(topic);
+        let mut payload = encode(payload, self.encoding);
         if matches!(
             topic,
             Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations
@@ -454,7 +456,8 @@ impl GatewayState {
                     Retention::Retained,
                 );
                 client.subscribe(&filters, MaxQos::AtLeastOnce);
-                (link.client, link.node) = (Some(client), node);
+                link.client = Some(client);
+                link.node = node;
                 LinkState::Up
             }
             LinkChange::DeclaredOffline => {
@@ -501,7 +504,8 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 
 /// Delivers the new state of a link to this node's actors.
 fn tell_state(inbox: &Inbox, link: &Link) {
-    let (broker, state) = (link.broker.clone(), link.state);
+    let broker = link.broker.clone();
+    let state = link.state;
     tracing::info!(%broker, %state, "link changed");
     inbox.deliver_link(
         Via {

@@ -118,7 +118,8 @@ impl Actor for Membership {
         let renewals = credentials
             .clone()
             .map(|credentials| Renewals::new(credentials, name.clone()));
-        let (now, own_name) = (clock::now(), name.clone());
+        let now = clock::now();
+        let own_name = name.clone();
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId {
             name,
@@ -370,7 +371,8 @@ impl CertificateWatch {
     /// The current certificates and time. Logs when the node's own certificate becomes valid or
     /// invalid, for example after a change of the clock.
     fn identity(&mut self) -> Identity {
-        let (credentials, wall) = (self.credentials.current(), UnixTime::now());
+        let credentials = self.credentials.current();
+        let wall = UnixTime::now();
         let own = credentials
             .verify_node(credentials.certificate(), wall)
             .err();
@@ -470,7 +472,9 @@ const MAX_SLEEP: Duration = Duration::from_secs(60);
 
 fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
     let random = SystemRandom::new();
-    let (mut session, mut secret, mut seed) = (SessionNonce::default(), [0; 32], [0; 8]);
+    let mut session = SessionNonce::default();
+    let mut secret = [0; 32];
+    let mut seed = [0; 8];
     let drawn = random
         .fill(&mut session)
         .and_then(|()| random.fill(&mut secret))

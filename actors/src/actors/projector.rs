@@ -158,7 +158,8 @@ impl Actor for Projector {
                 algorithms,
             } => {
                 state.perception = perception.continuing(&state.perception);
-                (state.standing, state.algorithms) = (standing, algorithms);
+                state.standing = standing;
+                state.algorithms = algorithms;
                 state.move_to(origin);
             }
             ProjectorMessage::TakePose { at, pose } => state.take_pose(at, &pose),
@@ -228,7 +229,8 @@ impl ProjectorState {
             offset_us,
             error_us,
         } = self.clock.reading();
-        (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
+        report.captured_at_us = captured_at.shifted(offset_us);
+        report.clock_error_us = error_us;
         report.moving = self.is_fixed.then_some(false);
         self.counters.add(
             Event::DetectionUnplaced,

@@ -189,10 +189,8 @@ impl Actor for ReputationKeeper {
 
 impl ReputationKeeperState {
     fn new(arguments: ReputationKeeperArguments) -> Self {
-        let (name, ticks_per_snapshot) = (
-            arguments.name.clone(),
-            arguments.config.ticks_per_snapshot(),
-        );
+        let name = arguments.name.clone();
+        let ticks_per_snapshot = arguments.config.ticks_per_snapshot();
         let credentials = arguments.credentials.clone();
         let mut writer = StateWriter::new(arguments.file.clone(), "reputations");
         // An earlier run may have left unsaved changes.
@@ -292,10 +290,8 @@ impl ReputationKeeperState {
                 .reject(RejectReason::BadSignature, share.node.as_str());
         }
         let mut store = self.arguments.reputations.open();
-        let (at, date) = (
-            delivery.received_at,
-            self.arguments.clock.date(delivery.received_at),
-        );
+        let at = delivery.received_at;
+        let date = self.arguments.clock.date(delivery.received_at);
         let merged =
             self.resync
                 .merge(share, &mut store.ledger, &candidates, &leadership, at, date);
@@ -456,7 +452,8 @@ impl ReputationKeeperState {
                 )
             })
             .await;
-        let (counters, troubles) = (&arguments.counters, arguments.counters.troubles());
+        let counters = &arguments.counters;
+        let troubles = arguments.counters.troubles();
         match outcome {
             SaveOutcome::Unchanged => {}
             SaveOutcome::Written => {

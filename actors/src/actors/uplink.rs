@@ -208,7 +208,8 @@ impl UplinkState {
         // An uplink that has ended needs no events.
         let subscriber =
             Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
-        let (limits, counters) = (self.connection.limits(), Arc::clone(&self.setup.counters));
+        let limits = self.connection.limits();
+        let counters = Arc::clone(&self.setup.counters);
         let sink = RegionInbox::new(
             (self.setup.cell.clone(), tile),
             self.setup.status.id,
@@ -322,7 +323,8 @@ impl UplinkState {
             neighbour_objects: Vec::new(),
             ..GlobalMap::clone(&map)
         };
-        let (schema, cell) = (SCHEMA_VERSION, self.setup.cell.clone());
+        let schema = SCHEMA_VERSION;
+        let cell = self.setup.cell.clone();
         if link.publish_map(
             &CellMap {
                 schema,

@@ -174,7 +174,8 @@ pub fn calibrate(
     if columns < 3 || rows < 3 || !(square_mm.is_finite() && square_mm > 0.0) {
         return Err(CalibrationError::InvalidBoard(*board));
     }
-    let (mut used, mut without_board) = (Vec::new(), Vec::new());
+    let mut used = Vec::new();
+    let mut without_board = Vec::new();
     let mut views = Vector::<Vector<Point2f>>::new();
     let mut size = None;
     for path in images {
@@ -330,7 +331,8 @@ fn solve(
         .map(|(column, row)| Point3f::new(f32::from(column) * square, f32::from(row) * square, 0.0))
         .collect();
     let boards: Vector<Vector<Point3f>> = views.iter().map(|_| corners.clone()).collect();
-    let (mut camera, mut distortion) = (Mat::default(), Mat::default());
+    let mut camera = Mat::default();
+    let mut distortion = Mat::default();
     let rms_px = calib3d::calibrate_camera(
         &boards,
         views,

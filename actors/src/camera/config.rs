@@ -198,7 +198,8 @@ impl OpticsConfig {
         if let Some(path) = &self.calibration {
             return Ok(Calibration::read(path)?.lens());
         }
-        let (width, height) = (self.width_px.unwrap_or(640), self.height_px.unwrap_or(480));
+        let width = self.width_px.unwrap_or(640);
+        let height = self.height_px.unwrap_or(480);
         let horizontal_rad = self.horizontal_fov_deg.to_radians();
         let intrinsics = match self.vertical_fov_deg {
             Some(angle_deg) => Intrinsics::from_field_of_view(

@@ -69,7 +69,8 @@ fn solve(
         .iter()
         .map(|corner| Point2d::new(corner.x, corner.y))
         .collect();
-    let (mut rotations, mut translations) = (Vector::<Mat>::new(), Vector::<Mat>::new());
+    let mut rotations = Vector::<Mat>::new();
+    let mut translations = Vector::<Mat>::new();
     calib3d::solve_pnp_generic(
         &target,
         &image,

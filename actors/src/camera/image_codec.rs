@@ -168,7 +168,8 @@ impl ImageBuffer for Pixels<'_> {
     }
 
     fn fill_buffers(&self, y: u16, [brightness, cb, cr, _]: &mut [Vec<u8>; 4]) {
-        let (row, width) = (usize::from(y), usize::from(self.width));
+        let row = usize::from(y);
+        let width = usize::from(self.width);
         if self.is_gray {
             return brightness.extend_from_slice(&self.pixels[row * width..][..width]);
         }

@@ -81,11 +81,10 @@ impl Lens {
             cx,
             cy,
         } = lens.intrinsics;
-        let (x, y) = (
-            f64::from(frame.width) / f64::from(width),
-            f64::from(frame.height) / f64::from(height),
-        );
-        let (width, height) = (frame.width, frame.height);
+        let x = f64::from(frame.width) / f64::from(width);
+        let y = f64::from(frame.height) / f64::from(height);
+        let width = frame.width;
+        let height = frame.height;
         Ok(Self {
             intrinsics: Intrinsics {
                 width,
@@ -132,7 +131,8 @@ mod tests {
     fn distorted(ideal: Point2<f64>) -> Point2<f64> {
         let Intrinsics { fx, fy, cx, cy, .. } = camera();
         let [k1, k2, p1, p2, k3, k4, k5, k6] = DISTORTION;
-        let (x, y) = ((ideal.x - cx) / fx, (ideal.y - cy) / fy);
+        let x = (ideal.x - cx) / fx;
+        let y = (ideal.y - cy) / fy;
         let r2 = x * x + y * y;
         let polynomial = |a, b, c| 1.0 + a * r2 + b * r2 * r2 + c * r2 * r2 * r2;
         let radial = polynomial(k1, k2, k3) / polynomial(k4, k5, k6);

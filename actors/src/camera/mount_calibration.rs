@@ -57,12 +57,11 @@ pub fn fit_mount_to_points(
         .map(|(pixel, place)| GroundPoint { pixel, place })
         .collect();
     let mut fit = fit_ground_points(&points, &lens.intrinsics)?;
-    let (on_vehicle, mount) = (fit.pose, &mut fit.estimate.mount);
-    (mount.forward_m, mount.left_m, mount.pan_rad) = (
-        on_vehicle.position.x,
-        on_vehicle.position.y,
-        on_vehicle.heading_rad,
-    );
+    let on_vehicle = fit.pose;
+    let mount = &mut fit.estimate.mount;
+    mount.forward_m = on_vehicle.position.x;
+    mount.left_m = on_vehicle.position.y;
+    mount.pan_rad = on_vehicle.heading_rad;
     fit.points
         .iter_mut()
         .for_each(|point| point.error_px /= scale);

@@ -149,7 +149,8 @@ impl Perception {
     pub fn set_lens(&mut self, lens: &Lens) {
         if self.vehicle_camera.lens != *lens {
             self.vehicle_camera.lens = *lens;
-            let (config, mount) = (self.projection.config().clone(), self.vehicle_camera.mount);
+            let config = self.projection.config().clone();
+            let mount = self.vehicle_camera.mount;
             self.projection = Projection::new(config, lens.intrinsics, mount);
             self.mount_check = MountCheck::default();
         }
@@ -161,7 +162,8 @@ impl Perception {
         mut detections: Vec<Detection>,
         captured_at: Timestamp,
     ) -> ObjectReport {
-        (self.discarded.is_size_missing, self.discarded.last_reason) = (false, None);
+        self.discarded.is_size_missing = false;
+        self.discarded.last_reason = None;
         let cuts: Vec<Cut> = detections
             .iter()
             .map(|detection| self.projection.cut(detection))
@@ -192,10 +194,8 @@ impl Perception {
             lens,
             ..
         } = &self.vehicle_camera;
-        let (camera, sizes) = (
-            PosedCamera::new(self.camera, mount, lens.intrinsics),
-            &self.projection.config().sizes,
-        );
+        let camera = PosedCamera::new(self.camera, mount, lens.intrinsics);
+        let sizes = &self.projection.config().sizes;
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
@@ -237,7 +237,8 @@ impl Perception {
     /// The reason as text, if all detections of the last frame lack a place, as in the seconds
     /// before.
     pub fn nothing_placed(&self) -> Option<String> {
-        let ([since, last], reason) = (self.unplaced?, self.last_discard()?);
+        let [since, last] = self.unplaced?;
+        let reason = self.last_discard()?;
         let time = last.since(since);
         (time >= UNPLACED_PATIENCE).then(|| {
             format!(

@@ -81,7 +81,9 @@ pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
     }
     let found = &report.calibration;
     found.write(output).context("cannot calibrate")?;
-    let (file, rms_px, photographs) = (output.display(), found.rms_px, found.images.len());
+    let file = output.display();
+    let rms_px = found.rms_px;
+    let photographs = found.images.len();
     Ok(print(&format!(
         "{file}: {rms_px:.3} px rms over {photographs} photographs\n"
     ))?)

@@ -119,7 +119,8 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
                 .into());
             }
             let lines = differences(&settings(&described.text)?, &settings(&text)?);
-            let (file, version) = (file.display(), described.version);
+            let file = file.display();
+            let version = described.version;
             if lines.is_empty() {
                 return Ok(print(&format!("no difference to version {version}\n"))?);
             }
@@ -132,7 +133,8 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
 /// Sets a description, and prints its cost.
 async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     let shared = SharedConfig::parse(text).map_err(Failure::usage)?;
-    let (places, cost) = (shared.landmarks.len(), shared.cost());
+    let places = shared.landmarks.len();
+    let cost = shared.cost();
     let CellDescription {
         version,
         hash,
@@ -216,13 +218,15 @@ impl DoorClient {
         let bound = running.and_then(|node| node.node.door);
         // Version 5 has reasons for refusals; the local broker requires no password.
         config.mqtt.version = MqttVersion::V5;
-        (config.mqtt.user, config.mqtt.password) = (None, None);
+        config.mqtt.user = None;
+        config.mqtt.password = None;
         let address = here(arguments.door.or(bound).unwrap_or(config.broker_listen()));
         let credentials = config.security().map_err(Failure::usage)?.credentials;
         let tls = credentials
             .as_ref()
             .map(|credentials| BrokerTrust::of_door(credentials).client());
-        let (process, run) = (std::process::id(), Uuid::new_v4().simple());
+        let process = std::process::id();
+        let run = Uuid::new_v4().simple();
         let client_id = match config.name.as_ref().filter(|_| tls.is_some()) {
             Some(name) => format!("{name}{OBSERVER_MARK}cell-{process}-{run}"),
             None => format!("ecod-cell-{process}"),
@@ -308,9 +312,11 @@ impl DoorClient {
 
     /// Sets a description; returns it as the node has numbered it.
     async fn set(&mut self, text: &str) -> Result<CellDescription, anyhow::Error> {
-        let (node, text) = (NodeName::from_static("node"), text.to_owned());
+        let node = NodeName::from_static("node");
+        let text = text.to_owned();
         let set_by = self.config.name.clone().unwrap_or(node);
-        let (schema, hash) = (SCHEMA_VERSION, ContentHash::default());
+        let schema = SCHEMA_VERSION;
+        let hash = ContentHash::default();
         let request = CellDescription {
             schema,
             version: 0,
@@ -353,7 +359,8 @@ impl DoorClient {
 
     /// The description as a file, with the nodes that have one in comments.
     async fn show(&mut self) -> Result<String, anyhow::Error> {
-        let (mut description, mut nodes) = (None, BTreeMap::new());
+        let mut description = None;
+        let mut nodes = BTreeMap::new();
         loop {
             let next = if description.is_none() {
                 Some(self.expect().await?)

@@ -129,7 +129,8 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     // Checked before any file is written: a directory with a CA must not get a second one.
     check_name(name).map_err(Failure::usage)?;
     let directory = arguments.node.directory.vacant()?;
-    let (role, now) = (role_named(role), clock::now());
+    let role = role_named(role);
+    let now = clock::now();
     let mut city = city
         .as_deref()
         .map(Authority::open)
@@ -324,7 +325,8 @@ fn read_token(argument: &str) -> anyhow::Result<Token> {
         return Ok(argument.parse()?);
     }
     let mut input = std::io::stdin().lock().take(MAX_TOKEN_BYTES);
-    let (mut text, mut line) = (String::new(), String::new());
+    let mut text = String::new();
+    let mut line = String::new();
     // A person who pastes a token does not end the input, but may send an empty line.
     while input.read_line(&mut line)? > 0 && !line.trim().is_empty() {
         text += &line;

@@ -33,7 +33,8 @@ impl Logs {
         LogsNodeArguments { node }: &LogsNodeArguments,
     ) -> Result<Self, Failure> {
         let paths = log_files(inputs).map_err(Failure::usage)?;
-        let (mut logs, mut nodes) = (Vec::new(), BTreeSet::new());
+        let mut logs = Vec::new();
+        let mut nodes = BTreeSet::new();
         for path in paths {
             let mut log = LogReader::open(&path).map_err(Failure::usage)?;
             let unusable = match log.next() {

@@ -224,10 +224,8 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
                     .map(|count| format!("{count} CAs of {cell}")),
                 (None, None) => return Err(anyhow!("name a vehicle, or a cell by --cell").into()),
             };
-            let (revoked, list) = (
-                revoked.map_err(failure)?,
-                shown(&authority.revocation_list()),
-            );
+            let revoked = revoked.map_err(failure)?;
+            let list = shown(&authority.revocation_list());
             format!(
                 "revoked {revoked}; copy the list to every node of the city's cells (no restart needed): {list}\n"
             )

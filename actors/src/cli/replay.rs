@@ -108,7 +108,8 @@ fn replay_lines(
 ) -> Result<Option<Usable>, Failure> {
     let mut source = lines::open(input).map_err(Failure::usage)?;
     let limit = config.limits.payload_bytes;
-    let (mut replay, mut line) = (Replay::new(config), Vec::new());
+    let mut replay = Replay::new(config);
+    let mut line = Vec::new();
     loop {
         match read_line(&mut source, limit, &mut line)
             .with_context(|| format!("cannot read {}", input.display()))?
@@ -151,7 +152,8 @@ impl Usable {
             placements: Placements { placed, misplaced },
             ..
         } = *summary;
-        let (used, faulty) = (summary.used(), summary.faulty(may_repeat));
+        let used = summary.used();
+        let faulty = summary.faulty(may_repeat);
         Self {
             reports: lines,
             used,

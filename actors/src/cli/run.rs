@@ -209,10 +209,8 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Runs the node until SIGINT or SIGTERM.
 async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
-    let (mut interrupt, mut terminate) = (
-        signal(SignalKind::interrupt())?,
-        signal(SignalKind::terminate())?,
-    );
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
     #[cfg(feature = "camera")]
     if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
         tracing::warn!(
@@ -255,7 +253,9 @@ async fn announce(config: &NodeConfig, mut page: watch::Receiver<Option<SocketAd
     let is_enabled = config.dashboard.enabled;
     let page = if is_enabled { bound.await } else { None };
     let name = config.name.as_ref().map_or("node", NodeName::as_str);
-    let (role, cell, version) = (config.role, &config.cell, env!("CARGO_PKG_VERSION"));
+    let role = config.role;
+    let cell = &config.cell;
+    let version = env!("CARGO_PKG_VERSION");
     tracing::info!("{name} ({role}) of cell {cell} runs, version {version}");
     match page {
         Some(page) if config.dashboard.token.is_some() => {

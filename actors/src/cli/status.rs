@@ -56,7 +56,8 @@ pub(super) fn run(arguments: &StatusArguments) -> Result<(), Failure> {
             Failure::no_node(anyhow!(error).context(format!("no node at {page}; {remedy}")))
         })?;
         if file.is_some() && !node.is_of(&config) {
-            let (name, cell) = (&node.node.name, &node.node.cell);
+            let name = &node.node.name;
+            let cell = &node.node.cell;
             let error = anyhow!(
                 "the page at {page} is of {name} in cell {cell}: name that of this node by --page"
             );

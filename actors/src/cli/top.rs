@@ -65,7 +65,8 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
 
 /// Waits until the terminal is closed, or the program is terminated, and restores the terminal.
 async fn terminal_gone([hangup, terminate]: [std::io::Result<Signal>; 2]) -> std::io::Result<()> {
-    let (mut hangup, mut terminate) = (hangup?, terminate?);
+    let mut hangup = hangup?;
+    let mut terminate = terminate?;
     let is_closed = tokio::select! {
         _ = hangup.recv() => true,
         _ = terminate.recv() => false,

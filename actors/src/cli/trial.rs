@@ -288,10 +288,8 @@ async fn serve(
 }
 
 async fn stop_signal() -> anyhow::Result<()> {
-    let (mut interrupt, mut terminate) = (
-        signal(SignalKind::interrupt())?,
-        signal(SignalKind::terminate())?,
-    );
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
@@ -363,7 +361,8 @@ async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
             .sum::<u64>()
     };
     let mut ticks = tokio::time::interval(PROGRESS_PERIOD);
-    let (mut frames, mut shown) = (0, String::new());
+    let mut frames = 0;
+    let mut shown = String::new();
     loop {
         ticks.tick().await;
         for node in nodes.iter_mut() {

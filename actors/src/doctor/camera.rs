@@ -102,7 +102,8 @@ async fn detections(
     frame: Option<CameraFrame>,
 ) -> Vec<Finding> {
     let check = "detector";
-    let (detector, lens) = (camera.detector.clone(), camera.optics.lens().ok());
+    let detector = camera.detector.clone();
+    let lens = camera.optics.lens().ok();
     let perception = node::camera::perception(config, camera).ok();
     let detected = tokio::task::spawn_blocking(move || {
         let mut detector = detector.build()?;
@@ -144,7 +145,8 @@ fn placed(
     size: ImageSize,
     mut found: Vec<Detection>,
 ) -> Option<Finding> {
-    let (check, count) = ("places", found.len());
+    let check = "places";
+    let count = found.len();
     perception.set_lens(&lens.fitted(size, &mut found).ok()?);
     let placed = perception.report(found, Timestamp::default()).objects.len();
     let seen = format!("{placed} of {count} objects have a place");

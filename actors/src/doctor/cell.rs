@@ -60,7 +60,8 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
 }
 
 fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
-    let (cell, nodes) = (&config.cell, node.other_nodes().len());
+    let cell = &config.cell;
+    let nodes = node.other_nodes().len();
     let leader = node.leadership().borrow().leader().map(NodeName::to_string);
     let fix = "start another node, or check that `cell` and the key are the same on all, `membership.seeds`, and that UDP 17884 \
         passes; the first node of a cell is alone";

@@ -110,7 +110,8 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
 
 /// Checks that a vehicle that moves between cells can join each of them.
 pub(super) fn cells(config: &NodeConfig) -> Option<Finding> {
-    let (check, path) = ("cells", config.cells.as_ref()?);
+    let check = "cells";
+    let path = config.cells.as_ref()?;
     let cells = match config.load_cells() {
         Ok(cells) => cells,
         Err(error) => {

@@ -266,10 +266,8 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     let IpAddr::V4(ip) = ip else { return None };
     let interface = multicast.interface.unwrap_or(ip);
     let returned = || -> io::Result<()> {
-        let (receiver, sender) = (
-            UdpSocket::bind((multicast.group, 0))?,
-            UdpSocket::bind((ip, 0))?,
-        );
+        let receiver = UdpSocket::bind((multicast.group, 0))?;
+        let sender = UdpSocket::bind((ip, 0))?;
         receiver.join_multicast_v4(&multicast.group, &interface)?;
         receiver.set_read_timeout(Some(MULTICAST_TIMEOUT))?;
         if !interface.is_unspecified() {

@@ -30,7 +30,8 @@ pub struct Newest {
 
 impl Default for Newest {
     fn default() -> Self {
-        let (map, verdicts) = (watch::Sender::new(None), watch::Sender::new(None));
+        let map = watch::Sender::new(None);
+        let verdicts = watch::Sender::new(None);
         Self {
             map,
             verdicts,

@@ -271,10 +271,8 @@ impl NodeBuilder {
     /// The parts that this node has, in the order of starting.
     pub(super) fn parts(&self) -> Vec<ActorKind> {
         let leads = self.config.may_lead();
-        let (is_whole, reports) = (
-            self.presence == Presence::Whole,
-            self.presence >= Presence::Reporting,
-        );
+        let is_whole = self.presence == Presence::Whole;
+        let reports = self.presence >= Presence::Reporting;
         let has_broker = self.config.has_broker() && (is_whole || self.config.serves_nodes());
         let mut parts = Vec::new();
         parts.extend((is_whole && self.config.record.is_some()).then_some(ActorKind::Recorder));

@@ -327,7 +327,8 @@ impl NodeConfig {
         self.election
             .validate()
             .map_err(|error| error.within("election"))?;
-        let (hello, join) = (self.membership.hello_ms, self.election.join_ms);
+        let hello = self.membership.hello_ms;
+        let join = self.election.join_ms;
         if hello.saturating_mul(2) > join {
             let allowed = format!(
                 "at most half of `election.join_ms`, {join}: a leader that is there must be found"

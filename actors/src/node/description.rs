@@ -47,7 +47,8 @@ impl HeldDescription {
         })?;
         if let Some(saved) = saved {
             if saved.text != text {
-                let (path, version) = (path.display(), saved.version);
+                let path = path.display();
+                let version = saved.version;
                 tracing::info!(%path, version, "the cell has a description, and not that file's: see `ecod-node cell diff`");
             }
             return Ok(Self {
@@ -80,7 +81,8 @@ impl HeldDescription {
     /// a description from other nodes must not stop a node, even at its start.
     pub(super) fn lay_over(&mut self, own: &NodeConfig) -> Option<NodeConfig> {
         let description = self.description.as_ref()?;
-        let (stamp, set_by) = (description.stamp(), &description.set_by);
+        let stamp = description.stamp();
+        let set_by = &description.set_by;
         let error = match own.described(&description.text) {
             Ok(config) => return Some(config),
             Err(error) => error,
@@ -116,7 +118,8 @@ const MAX_PROBLEM: usize = 500;
 
 /// File in which a node stores the cell's description, if it keeps state.
 pub(crate) fn description_file(config: &NodeConfig) -> Option<StateFile> {
-    let (directory, name) = (config.state_dir.as_deref()?, config.name.as_ref()?);
+    let directory = config.state_dir.as_deref()?;
+    let name = config.name.as_ref()?;
     Some(StateFile::new(directory, &config.cell, name, "description"))
 }
 

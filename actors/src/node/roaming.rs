@@ -66,7 +66,8 @@ impl Roamer {
         cells.retain(|cell| match config.credentials_in(cell) {
             Ok(_) => true,
             Err(error) => {
-                let (about, cause) = (cell.name.as_str(), error.to_string());
+                let about = cell.name.as_str();
+                let cause = error.to_string();
                 vehicle
                     .counters
                     .troubles()
@@ -131,7 +132,8 @@ impl Roamer {
 
     /// Processes the latest position, if there is one.
     async fn look(&mut self) -> Result<(), NodeError> {
-        let (now, troubles) = (clock::now(), self.vehicle.counters.troubles());
+        let now = clock::now();
+        let troubles = self.vehicle.counters.troubles();
         let place = self.place();
         if place.is_some() {
             self.placed_at = now;
@@ -155,7 +157,8 @@ impl Roamer {
         };
         let now = clock::now();
         let is_fresh = now.since(at).max(at.since(now)) <= MAX_POSE_AGE;
-        let (latitude_deg, longitude_deg) = (pose.latitude_deg, pose.longitude_deg);
+        let latitude_deg = pose.latitude_deg;
+        let longitude_deg = pose.longitude_deg;
         is_fresh.then(|| GeographicPosition {
             latitude_deg,
             longitude_deg,
@@ -246,11 +249,9 @@ async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Ch
     let Some((cell, node)) = next else {
         return std::future::pending().await;
     };
-    let (mut maps, mut verdicts, mut shared) = (
-        node.newest_map(),
-        node.newest_verdicts(),
-        node.shared.clone(),
-    );
+    let mut maps = node.newest_map();
+    let mut verdicts = node.newest_verdicts();
+    let mut shared = node.shared.clone();
     let follows = async {
         let has_round = tokio::select! {
             map = maps.wait_for(Option::is_some) => map.is_ok(),

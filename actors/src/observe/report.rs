@@ -292,7 +292,8 @@ impl Report {
     fn leader(&mut self, at: Timestamp, epoch: Epoch) {
         match self.leaders.last_mut() {
             Some(leader) if leader.epoch == epoch && at.since(leader.last_at) < GAP => {
-                (leader.last_at, leader.rounds) = (at, leader.rounds + 1);
+                leader.last_at = at;
+                leader.rounds += 1;
             }
             _ => self.leaders.push(LeaderRounds {
                 epoch,

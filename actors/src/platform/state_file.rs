@@ -99,7 +99,8 @@ impl StateFile {
     pub fn set_aside(&self, why: &str) {
         let aside = self.path.with_extension("set-aside");
         let failure = fs::rename(&self.path, &aside).err().map(display);
-        let (path, aside) = (self.path.display(), aside.display());
+        let path = self.path.display();
+        let aside = aside.display();
         tracing::warn!(
             %path, %aside, why, failure,
             "state set aside, the node goes on without it; to use a copy of yours, put it there while the node is stopped"
@@ -297,10 +298,8 @@ mod tests {
         use std::os::unix::fs::PermissionsExt;
 
         let directory = tempfile::tempdir().unwrap();
-        let (key, left_over) = (
-            directory.path().join("edge.key"),
-            directory.path().join("edge.tmp"),
-        );
+        let key = directory.path().join("edge.key");
+        let left_over = directory.path().join("edge.tmp");
         fs::write(&left_over, "half a certificate").unwrap();
         fs::set_permissions(&left_over, PermissionsExt::from_mode(0o644)).unwrap();
         replace_file(&key, b"secret", 0o600).unwrap();

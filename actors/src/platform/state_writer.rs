@@ -67,7 +67,8 @@ impl StateWriter {
             if !std::mem::take(&mut self.is_unsaved) {
                 return SaveOutcome::Unchanged;
             }
-            let (file, state) = (file.clone(), state());
+            let file = file.clone();
+            let state = state();
             self.writing = Some(tokio::task::spawn_blocking(move || file.save(&state)));
         }
         let Some(writing) = &mut self.writing else {
@@ -117,10 +118,8 @@ mod tests {
     #[tokio::test]
     async fn a_disk_that_hangs_is_waited_for_once_and_what_changed_meanwhile_is_written() {
         let directory = tempfile::tempdir().unwrap();
-        let (lot, euclid) = (
-            NodeName::from_static("lot-1"),
-            NodeName::from_static("euclid"),
-        );
+        let lot = NodeName::from_static("lot-1");
+        let euclid = NodeName::from_static("euclid");
         let file = StateFile::new(directory.path(), &lot, &euclid, "counts");
         let mut writer = StateWriter::new(Some(file.clone()), "counts");
         assert_eq!(writer.save(|| 1).await, SaveOutcome::Unchanged);

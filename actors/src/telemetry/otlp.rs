@@ -73,7 +73,8 @@ impl Tracer for NamingTracer {
     type Span = <SdkTracer as Tracer>::Span;
 
     fn build_with_context(&self, mut builder: SpanBuilder, parent: &Context) -> Self::Span {
-        let (mut name, mut remote) = (None, None);
+        let mut name = None;
+        let mut remote = None;
         let mut attributes = builder.attributes.take().unwrap_or_default();
         attributes.retain(|KeyValue { key, value, .. }| {
             let value = value.as_str();

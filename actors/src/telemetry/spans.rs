@@ -95,7 +95,8 @@ impl Spans {
         if !span_enabled!(Level::INFO) {
             return Span::none();
         }
-        let (mut frames, mut since) = (String::new(), self.clock.undate(round.fused_at));
+        let mut frames = String::new();
+        let mut since = self.clock.undate(round.fused_at);
         for ((node, captured_at), received_at) in &reports.0 {
             let frame = self.frame_name(node, *captured_at).to_string();
             drop(info_span!(

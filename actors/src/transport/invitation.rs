@@ -227,7 +227,8 @@ mod tests {
 
     #[tokio::test]
     async fn guests_that_have_not_joined_in_time_are_named_and_find_nobody() {
-        let (wait, began) = (Duration::from_secs(2), Instant::now());
+        let wait = Duration::from_secs(2);
+        let began = Instant::now();
         let Scene {
             token,
             mut serving,

@@ -72,10 +72,8 @@ async fn a_vehicle_with_two_cameras_sees_both_ways_and_is_one_witness() {
     let box_ = r#"{"x_min":300,"y_min":220,"x_max":340,"y_max":260}"#;
     let line = format!(r#"[{{"label":"crate","confidence":0.9,"bounding_box":{box_}}}]"#);
     std::fs::write(&detections, line + "\n").unwrap();
-    let (photos, frames) = (
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/photos"),
-        folder.path().join("frames"),
-    );
+    let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/photos");
+    let frames = folder.path().join("frames");
     let photo = std::fs::read_dir(photos)
         .unwrap()
         .map(|entry| entry.unwrap().path());

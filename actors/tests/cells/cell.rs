@@ -86,7 +86,8 @@ async fn reported(
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_one_vehicle_sees_reaches_another() {
     let edge = edge().await;
-    let (euclid, galileo) = (cav("euclid", &edge).await, cav("galileo", &edge).await);
+    let euclid = cav("euclid", &edge).await;
+    let galileo = cav("galileo", &edge).await;
     let sees = || report("euclid", "ABC123", 1);
     let map = reported(&euclid, &galileo, sees, |map| {
         label(map, 1) == Some("ABC123")

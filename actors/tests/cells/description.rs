@@ -248,13 +248,15 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
     };
     timeout(PATIENCE, voted).await.expect("votes count");
 
-    let (all, mut taken) = ([&gauss, &euclid, &edge], Vec::new());
+    let all = [&gauss, &euclid, &edge];
+    let mut taken = Vec::new();
     for change in 2..=6 {
         let name = format!("new-{change}");
         let text = described(&["other", "slot-1", &name], tracked);
         let set = set(text, if change % 2 == 0 { &euclid } else { &edge }).await;
         assert!(set.starts_with(&format!("version {change}, ")), "{set}");
-        let (at, votes) = (newest_round(&all), right_votes(&gauss, "gauss"));
+        let at = newest_round(&all);
+        let votes = right_votes(&gauss, "gauss");
         let has_new = |map: &GlobalMap| places(map).contains(&name.as_str());
         let [at_gauss, at_euclid, at_edge] =
             all.map(|node| map_where(node, "of the new places", has_new));

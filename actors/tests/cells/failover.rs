@@ -131,7 +131,8 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
     let address = broker
         .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
         .unwrap();
-    let (first, second) = (Path::to(address).await, Path::to(address).await);
+    let first = Path::to(address).await;
+    let second = Path::to(address).await;
     let mut cell = Cell::new(config);
     for (name, path) in [("euclid", &first), ("gauss", &second)] {
         let mut config = cell.config(name, Role::Auto);

@@ -33,7 +33,8 @@ type Shown = [String; 3];
 /// A node with certificates, in the directory of the cell.
 fn configure(node: &str, role: Role, directory: &Path) -> NodeConfig {
     let mut config = node_config(node, "lot", role);
-    let (pki, name) = (directory.join("pki"), NodeName::new(node).unwrap());
+    let pki = directory.join("pki");
+    let name = NodeName::new(node).unwrap();
     let mut authority = Authority::open(&pki)
         .or_else(|_| Authority::init(&pki, &NodeName::from_static("lot"), clock::wall()))
         .unwrap();
@@ -64,7 +65,8 @@ impl Watched {
     fn new() -> Self {
         let counters = Arc::<Mutex<BTreeMap<String, Arc<Counters>>>>::default();
         let shown = Arc::<Mutex<BTreeMap<Shown, String>>>::default();
-        let (watched, seen) = (Arc::clone(&counters), Arc::clone(&shown));
+        let watched = Arc::clone(&counters);
+        let seen = Arc::clone(&shown);
         let watch = tokio::spawn(async move {
             loop {
                 for (node, counters) in watched.lock().unwrap().iter() {

@@ -271,8 +271,10 @@ async fn recorded_frames_change_nothing() {
     let recorder = Arc::new(UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap());
     let mut second = Node::start("node-2", config(&[recorder.local_addr().unwrap()])).await;
     let recording = Arc::<Mutex<Vec<Vec<u8>>>>::default();
-    let (one, two) = (first.address, second.address);
-    let (relay, tape) = (Arc::clone(&recorder), Arc::clone(&recording));
+    let one = first.address;
+    let two = second.address;
+    let relay = Arc::clone(&recorder);
+    let tape = Arc::clone(&recording);
     let relaying = tokio::spawn(async move {
         let mut buffer = [0; 2048];
         loop {

@@ -141,7 +141,8 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
     let mut has_stopped = false;
     while !has_stopped {
         let report = next(&mut events, "detections/euclid").await;
-        let (pose, object) = (report.pose.unwrap(), &report.objects[0]);
+        let pose = report.pose.unwrap();
+        let object = &report.objects[0];
         let true_x_m = x_m(started, report.captured_at_us);
         // Where it starts and stops, poses that come late on a busy machine are continued wrongly for a moment.
         if (0.5..STOPS_AT_M).contains(&true_x_m) {
@@ -265,8 +266,8 @@ async fn poses_on_earth_follow_the_origin_of_the_cell() {
     };
     let mut config = vehicle("euclid", earth, directory.path());
     config.membership.seeds = seeds.clone();
-    (config.dashboard.enabled, config.dashboard.listen) =
-        (true, Some("127.0.0.1:0".parse().unwrap()));
+    config.dashboard.enabled = true;
+    config.dashboard.listen = Some("127.0.0.1:0".parse().unwrap());
     let standing = node::start(config).await.unwrap();
     let poses = free_address().await;
     let mut config = vehicle(

@@ -74,7 +74,8 @@ impl City {
             ca: self.city.ca(),
             revocation_list: Some(self.city.revocation_list()),
         };
-        let (ca, list) = (self.cells[cell].ca(), self.cells[cell].revocation_list());
+        let ca = self.cells[cell].ca();
+        let list = self.cells[cell].revocation_list();
         TlsConfig {
             ca,
             certificate,
@@ -190,7 +191,8 @@ impl Town {
     }
 
     async fn with(with_edge: &[usize], directory: TempDir, mut city: Option<City>) -> Self {
-        let (mut edges, mut readers) = (BTreeMap::new(), JoinSet::new());
+        let mut edges = BTreeMap::new();
+        let mut readers = JoinSet::new();
         for &cell in with_edge {
             let edge = format!("edge-{cell}");
             let description = directory.path().join(format!("{edge}.toml"));
@@ -302,10 +304,8 @@ impl Town {
         std::fs::write(directory.join("cells.toml"), cells).unwrap();
         let camera = car_ahead(directory);
         let mut config = config(0, "euclid", role);
-        (config.cells, config.map_log) = (
-            Some(directory.join("cells.toml")),
-            Some(directory.join("maps")),
-        );
+        config.cells = Some(directory.join("cells.toml"));
+        config.map_log = Some(directory.join("maps"));
         config.pose.listen = Some(self.poses);
         config.membership.seeds = self.seeds(0);
         config.origin = Some(middle(0));
@@ -363,7 +363,8 @@ impl Driving {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_vehicle_reports_in_the_cell_in_which_it_is_and_never_in_two() {
     let mut town = Town::new(&[0, 1]).await;
-    let (first, second) = (town.reports(0).await, town.reports(1).await);
+    let first = town.reports(0).await;
+    let second = town.reports(1).await;
     let vehicle = Driving::start(Roamer::start(town.vehicle(Role::Cav)).await.unwrap());
     first.more().await;
     assert_eq!(second.count(), 0);
@@ -471,7 +472,8 @@ async fn a_vehicle_leads_at_home_alone_and_follows_elsewhere() {
 async fn a_vehicle_that_cannot_know_where_it_is_says_so() {
     let mut town = Town::new(&[0]).await;
     let mut config = town.vehicle(Role::Cav);
-    (config.pose.listen, config.camera) = (Some(loopback()), None);
+    config.pose.listen = Some(loopback());
+    config.camera = None;
     let mut vehicle = Roamer::start(config).await.unwrap();
     let told = timeout(Duration::from_secs(3), vehicle.drive()).await;
     assert!(told.is_err(), "it drives on");

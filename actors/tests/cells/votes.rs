@@ -311,7 +311,8 @@ async fn another_candidate_leads_with_the_same_reputations() {
     )
     .await;
     // The last votes are settled and published when nothing new has come for a second, and the standby knows the same.
-    let (mut last, mut since) = (from_edge().unwrap(), Instant::now());
+    let mut last = from_edge().unwrap();
+    let mut since = Instant::now();
     let known = |node: &NodeHandle| reputations(node).map(|newest| newest.reputations.clone());
     while since.elapsed() < Duration::from_secs(1)
         || known(&standby).as_ref() != Some(&last.reputations)
@@ -408,7 +409,8 @@ async fn votes_that_cannot_count_are_counted() {
     let edge = edge(|_| ()).await;
     let euclid = cav("euclid", &edge).await;
     let send = |report: &Arc<ObjectReport>| {
-        let (kind, report) = (ReportKind::VoteDetections, Arc::clone(report));
+        let kind = ReportKind::VoteDetections;
+        let report = Arc::clone(report);
         euclid
             .slots()
             .gateway

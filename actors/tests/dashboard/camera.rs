@@ -39,30 +39,32 @@ pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
         "chelsea",
         &[("dog", [0.45, 0.5, 0.55, 0.7])],
     );
-    (rear.name, rear.mount.forward_m, rear.mount.pan_deg) = (Some("rear".into()), -2.0, 180.0);
+    rear.name = Some("rear".into());
+    rear.mount.forward_m = -2.0;
+    rear.mount.pan_deg = 180.0;
     both.cameras = vec![rear];
     both
 }
 
 /// A camera that shows a photograph, with these detections: label, and edges as shares of the picture.
 fn camera(directory: &Path, photograph: &str, seen: &[(&str, [f64; 4])]) -> CameraConfig {
-    let (frames, detections) = (directory.join("frames"), directory.join("detections.jsonl"));
+    let frames = directory.join("frames");
+    let detections = directory.join("detections.jsonl");
     std::fs::create_dir_all(&frames).unwrap();
     let photograph = format!(
         "{}/tests/data/photos/{photograph}.jpg",
         env!("CARGO_MANIFEST_DIR")
     );
     let photograph = image_codec::read(photograph.as_ref()).unwrap();
-    let (width, height) = (photograph.cols(), photograph.rows());
+    let width = photograph.cols();
+    let height = photograph.rows();
     for frame in 0..2 {
         let jpeg = image_codec::encode_jpeg(&photograph, 95).unwrap();
         std::fs::write(frames.join(format!("{frame}.jpg")), jpeg).unwrap();
     }
     let seen = seen.iter().map(|(label, [left, top, right, bottom])| {
-        let (x, y) = (
-            |share: f64| share * f64::from(width),
-            |share: f64| share * f64::from(height),
-        );
+        let x = |share: f64| share * f64::from(width);
+        let y = |share: f64| share * f64::from(height);
         serde_json::json!({ "label": label, "confidence": 0.87, "bounding_box":
             { "x_min": x(*left), "y_min": y(*top), "x_max": x(*right), "y_max": y(*bottom) } })
     });

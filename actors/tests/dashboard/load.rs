@@ -152,7 +152,8 @@ async fn a_flood_without_the_token_slows_down_nobody_who_has_it() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn connections_that_say_nothing_give_way_and_are_closed_soon() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
-    let (most, mut silent) = (DashboardConfig::default().max_connections, Vec::new());
+    let most = DashboardConfig::default().max_connections;
+    let mut silent = Vec::new();
     for _ in 0..most + 10 {
         silent.push(TcpStream::connect(page).await.unwrap());
     }
@@ -181,7 +182,8 @@ async fn as_many_pages_as_may_be_open_leave_room_for_machines() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.max_connections = 8;
     let (node, page) = start(config).await;
-    let (mut live, mut kept) = (Vec::new(), Vec::new());
+    let mut live = Vec::new();
+    let mut kept = Vec::new();
     for _ in 0..4 {
         live.push(Events::open(page).await);
         live.last_mut().unwrap().next().await;

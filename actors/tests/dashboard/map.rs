@@ -300,7 +300,8 @@ fn with_plan(directory: &Path) -> NodeConfig {
     let ink = Scalar::new(80.0, 60.0, 40.0, 0.0);
     for [left, top, right, bottom] in [[4, 4, 796, 396], [170, 60, 560, 140], [170, 260, 560, 340]]
     {
-        let (from, to) = (Point::new(left, top), Point::new(right, bottom));
+        let from = Point::new(left, top);
+        let to = Point::new(right, bottom);
         let area = opencv::core::Rect::from_points(from, to);
         imgproc::rectangle(&mut plan, area, ink, 4, imgproc::LINE_8, 0).unwrap();
     }

@@ -103,12 +103,15 @@ async fn reports(page: SocketAddr, reporter: &str) {
 async fn points_give_the_mount_of_the_named_camera_and_the_wrong_one_is_named() {
     let directory = tempfile::tempdir().unwrap();
     let mut both = seeing_both_ways(directory.path());
-    (both.pose.x_m, both.pose.y_m, both.pose.heading_deg) = (10.0, -5.0, 90.0);
+    both.pose.x_m = 10.0;
+    both.pose.y_m = -5.0;
+    both.pose.heading_deg = 90.0;
     let (node, page) = start(both).await;
     reports(page, "euclid--rear").await;
     let vehicle = Pose::new(10.0, -5.0, 90f64.to_radians());
-    let (pitch_rad, roll_rad, pan_rad) =
-        (15f64.to_radians(), -2f64.to_radians(), 176f64.to_radians());
+    let pitch_rad = 15f64.to_radians();
+    let roll_rad = -2f64.to_radians();
+    let pan_rad = 176f64.to_radians();
     let rear = Mount {
         forward_m: -1.8,
         left_m: 0.1,
@@ -230,7 +233,8 @@ async fn a_mount_is_clicked_corrected_and_copied_in_the_page() {
     let mut seeing = seeing(directory.path());
     seeing.landmarks = config("euclid", Role::Auto, 6).landmarks;
     seeing.pose.x_m = -10.0;
-    let (vehicle, pitch_rad) = (Pose::new(-10.0, 0.0, 0.0), 20f64.to_radians());
+    let vehicle = Pose::new(-10.0, 0.0, 0.0);
+    let pitch_rad = 20f64.to_radians();
     let real = Mount {
         forward_m: 0.5,
         height_m: Some(5.0),

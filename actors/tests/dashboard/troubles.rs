@@ -252,7 +252,8 @@ fn watching(
     detections: &str,
     more: &str,
 ) -> NodeConfig {
-    let (frames, recorded) = (directory.join("frames"), directory.join("detections.jsonl"));
+    let frames = directory.join("frames");
+    let recorded = directory.join("detections.jsonl");
     std::fs::create_dir_all(&frames).unwrap();
     let gray = [
         format!("P6 {width} {height} 255\n").as_bytes(),
@@ -324,18 +325,20 @@ async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason(
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_camera_that_has_turned_is_named_with_its_angle() {
     let directory = tempfile::tempdir().unwrap();
-    let (focal_px, camera_m, person_m, turned) = (530.0, 1.5, 1.7, 6f64.to_radians());
+    let focal_px = 530.0;
+    let camera_m = 1.5;
+    let person_m = 1.7;
+    let turned = 6f64.to_radians();
     let row_px = |slope: f64| 240.0 + focal_px * (slope.atan() + turned).tan();
     let people = (4..16).map(|distance| {
-        let (distance_m, x_px) = (f64::from(distance), 40.0 * f64::from(distance) - 130.0);
+        let distance_m = f64::from(distance);
+        let x_px = 40.0 * f64::from(distance) - 130.0;
         let [y_min, y_max] = [camera_m - person_m, camera_m].map(|below_m| row_px(below_m / distance_m));
         let bounding_box = serde_json::json!({"x_min": x_px, "x_max": x_px + 20.0, "y_min": y_min, "y_max": y_max});
         serde_json::json!({"label": "person", "confidence": 0.9, "bounding_box": bounding_box})
     });
-    let (people, mount) = (
-        serde_json::Value::from_iter(people).to_string(),
-        format!("mount = {{ height_m = {camera_m} }}"),
-    );
+    let people = serde_json::Value::from_iter(people).to_string();
+    let mount = format!("mount = {{ height_m = {camera_m} }}");
     let (node, page) = start(watching(
         "euclid",
         directory.path(),

@@ -73,7 +73,8 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
         "mosquitto_pub is missing: install Debian's package mosquitto-clients"
     );
     let (node, broker) = edge(None).await;
-    let (maps, verdicts) = (node.newest_map(), node.newest_verdicts());
+    let maps = node.newest_map();
+    let verdicts = node.newest_verdicts();
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");
         let [report, receive, _with_certificates] = &*scripts else {
@@ -92,7 +93,8 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
         let mut reporter = run(report);
         // The second script begins when the cell has fused.
         let has_fused = || {
-            let (map, verdicts) = (maps.borrow(), verdicts.borrow());
+            let map = maps.borrow();
+            let verdicts = verdicts.borrow();
             let seen = map
                 .as_ref()
                 .and_then(|newest| newest.map.landmarks[0].label.as_deref());
@@ -138,10 +140,8 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
     let directory = tempfile::tempdir().unwrap();
-    let (cell, name) = (
-        NodeName::from_static("lot-1"),
-        NodeName::from_static("edge"),
-    );
+    let cell = NodeName::from_static("lot-1");
+    let name = NodeName::from_static("edge");
     let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
     authority
         .issue(&name, Role::Edge, Duration::from_secs(86_400), clock::now())

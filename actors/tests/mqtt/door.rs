@@ -96,7 +96,8 @@ async fn a_program_gets_what_its_node_accepts_also_when_the_leader_is_killed() {
                 .map(|(round, _)| round.clone())
                 .collect::<Vec<_>>()
         };
-        let (accepted_rounds, got_rounds) = (rounds(&accepted), rounds(&got));
+        let accepted_rounds = rounds(&accepted);
+        let got_rounds = rounds(&got);
         assert!(
             got_rounds.windows(2).all(|pair| pair[0] < pair[1]),
             "{name}: in order, none twice: {got_rounds:?}"
@@ -403,10 +404,8 @@ async fn votes_at_the_door_of_a_follower_are_in_the_verdicts_at_another() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_program_that_floods_costs_its_node_and_the_cell_nothing() {
     let cell = Cell::of_four().await;
-    let (flood, quiet) = (
-        Program::connect("flood", cell.door("euclid"), &[]).await,
-        Program::connect("radar", cell.door("noether"), &[]).await,
-    );
+    let flood = Program::connect("flood", cell.door("euclid"), &[]).await;
+    let quiet = Program::connect("radar", cell.door("noether"), &[]).await;
     let flooding = async {
         for seq in 0..3000 {
             flood.report("detections", "euclid--flood", seq, 0.0).await;

@@ -34,7 +34,8 @@ async fn a_region_gets_maps_at_their_rate_and_keeps_status_and_description() {
         until("eleven maps", async || subscriber.maps("north").len() >= 11).await;
         let maps = subscriber.maps("north");
         assert_in_order(&maps);
-        let (first, last) = (&maps[0].1, &maps[10].1);
+        let first = &maps[0].1;
+        let last = &maps[10].1;
         let mean = last.since(*first).as_secs_f64() / 10.0;
         eprintln!("{}: {:.3} s from map to map", broker.name(), mean);
         assert!((0.4..1.0).contains(&mean), "{mean}");

@@ -22,8 +22,9 @@ fn camera() -> Intrinsics {
 }
 
 fn real() -> Mount {
-    let (pitch_rad, roll_rad, pan_rad) =
-        (18f64.to_radians(), (-2f64).to_radians(), 6f64.to_radians());
+    let pitch_rad = 18f64.to_radians();
+    let roll_rad = (-2f64).to_radians();
+    let pan_rad = 6f64.to_radians();
     Mount {
         height_m: Some(3.5),
         pitch_rad,
@@ -203,9 +204,11 @@ fn points_give_the_whole_mount_name_the_wrong_one_and_leave_the_rest_of_the_file
 /// Boxes of a frame: people of several heights on their ways, at a time in seconds.
 fn people(at_s: f64) -> Vec<Detection> {
     let heights_m = [1.58, 1.83, 1.66, 1.74, 1.55, 1.79, 1.62, 1.7];
-    let (level, mut boxes) = (Pose::new(0.0, 0.0, 0.0), Vec::new());
+    let level = Pose::new(0.0, 0.0, 0.0);
+    let mut boxes = Vec::new();
     for (person, height_m) in (0u32..).zip(heights_m) {
-        let (phase, reach_m) = (f64::from(person) * 1.9, 4.0 + f64::from(person % 3));
+        let phase = f64::from(person) * 1.9;
+        let reach_m = 4.0 + f64::from(person % 3);
         let middle = Point2::new(
             11.0 + reach_m * (at_s * 0.25 + phase).sin(),
             3.0 * (at_s * 0.17 + 2.0 * phase).cos(),

@@ -637,13 +637,12 @@ fn evidence_and_term_are_reset_while_the_node_is_stopped() {
 #[test]
 fn a_node_without_camera_goes_on_as_the_program_without_opencv() {
     let prefix = tempfile::tempdir().unwrap();
-    let (bin, lib) = (
-        prefix.path().join("bin"),
-        prefix.path().join("lib/ecod-node"),
-    );
+    let bin = prefix.path().join("bin");
+    let lib = prefix.path().join("lib/ecod-node");
     std::fs::create_dir_all(&bin).unwrap();
     std::fs::create_dir_all(&lib).unwrap();
-    let (program, other) = (bin.join("ecod-node"), lib.join("ecod-node"));
+    let program = bin.join("ecod-node");
+    let other = lib.join("ecod-node");
     let script = prefix.path().join("script");
     std::fs::write(&script, "#!/bin/sh\necho \"without camera: $@\"\n").unwrap();
     // Another process writes the programs. A child that another thread starts meanwhile would inherit a file that this

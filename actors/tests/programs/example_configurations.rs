@@ -54,10 +54,8 @@ fn the_example_vehicles_fit_the_example_edge() {
         assert_eq!(vehicle.cell, edge.cell);
         assert_eq!(vehicle.membership, edge.membership);
         let description = std::fs::read_to_string(example("cell.toml")).unwrap();
-        let (described, edge) = (
-            vehicle.described(&description).unwrap(),
-            edge.described(&description).unwrap(),
-        );
+        let described = vehicle.described(&description).unwrap();
+        let edge = edge.described(&description).unwrap();
         assert_eq!(
             (&described.landmarks, &described.fusion),
             (&edge.landmarks, &edge.fusion)
@@ -268,7 +266,8 @@ fn load_with(key: &str, value: &str) -> Result<NodeConfig, String> {
 fn documented_defaults_and_ranges_are_those_of_the_code() {
     let camera = load_with("cell", "\"cell\"").unwrap();
     let defaults: toml::Table = camera.to_toml().unwrap().parse().unwrap();
-    let (mut defaults_checked, mut bounds_checked) = (0, 0);
+    let mut defaults_checked = 0;
+    let mut bounds_checked = 0;
     let mut faults = Vec::new();
     for DocumentedKey {
         key,

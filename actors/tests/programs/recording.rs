@@ -93,7 +93,8 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
             .filter(|line| key(line).0 == node)
             .collect();
         let (again, said) = replay(&dir);
-        let (own, again) = (by_key(&own), by_key(&again));
+        let own = by_key(&own);
+        let again = by_key(&again);
         for (key, line) in &own {
             assert_eq!(again.get(key), Some(line), "{node}: {key:?}\n{said}");
         }

@@ -42,11 +42,9 @@ fn text(path: &Path) -> &str {
 
 /// Replays the example and returns the output.
 fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
-    let (config, input, output) = (
-        example("recordings/lot.toml"),
-        example("recordings/lot.jsonl"),
-        folder.path().join(name),
-    );
+    let config = example("recordings/lot.toml");
+    let input = example("recordings/lot.jsonl");
+    let output = folder.path().join(name);
     let arguments = [
         "replay",
         "--config",
@@ -69,10 +67,8 @@ fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
 #[test]
 fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
     let folder = TempDir::new().unwrap();
-    let (first, second) = (
-        replay_lot(&folder, "1.jsonl"),
-        replay_lot(&folder, "2.jsonl"),
-    );
+    let first = replay_lot(&folder, "1.jsonl");
+    let second = replay_lot(&folder, "2.jsonl");
     let bytes = fs::read(first).unwrap();
     assert!(!bytes.is_empty());
     assert!(bytes == fs::read(second).unwrap());
@@ -180,10 +176,8 @@ fn reports_of_which_none_has_an_effect_fail() {
     };
     let detection =
         |x_m: u32| format!(r#""objects":[{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}]"#);
-    let (no_vote, no_object) = (
-        "1 of 1 votes do not count",
-        "no report has an object at a known location",
-    );
+    let no_vote = "1 of 1 votes do not count";
+    let no_object = "no report has an object at a known location";
     for (report, problem) in [
         (vote("table", 0), None),
         (vote("tabel", 0), Some(no_vote)),
@@ -221,10 +215,8 @@ fn reports_of_which_none_has_an_effect_fail() {
 #[test]
 fn input_that_is_no_recording_fails() {
     let folder = TempDir::new().unwrap();
-    let (readme, empty) = (
-        folder.path().join("README.md"),
-        folder.path().join("empty.jsonl"),
-    );
+    let readme = folder.path().join("README.md");
+    let empty = folder.path().join("empty.jsonl");
     fs::write(&readme, "# A title\n\nSome text.\n").unwrap();
     fs::write(&empty, "").unwrap();
     for input in [&readme, &empty] {
@@ -308,14 +300,13 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         fs::write(&path, content).unwrap();
         path
     };
-    let (recording, typo) = (
-        file("in.jsonl", "{}\n"),
-        file("typo.toml", "[fusion.pace]\ngat_m = 1\n"),
-    );
+    let recording = file("in.jsonl", "{}\n");
+    let typo = file("typo.toml", "[fusion.pace]\ngat_m = 1\n");
     let fusion = file("fusion.toml", "[fusion]\n");
     let fusion = text(&fusion);
     let out = folder.path().join("out.jsonl");
-    let (recording, out) = (text(&recording), text(&out));
+    let recording = text(&recording);
+    let out = text(&out);
     for (arguments, code, part) in [
         (
             vec!["replay", "--input", "/no/such.jsonl", "--output", out],

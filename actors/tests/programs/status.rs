@@ -35,7 +35,9 @@ impl Drop for Process {
 fn machine(role: &str) -> (TempDir, SocketAddr) {
     let directory = tempfile::tempdir().unwrap();
     let tcp = || TcpListener::bind("127.0.0.1:0").unwrap();
-    let (page, broker, gossip) = (tcp(), tcp(), UdpSocket::bind("127.0.0.1:0").unwrap());
+    let page = tcp();
+    let broker = tcp();
+    let gossip = UdpSocket::bind("127.0.0.1:0").unwrap();
     let page_address = page.local_addr().unwrap();
     let toml = format!(
         "name = \"ada\"\ncell = \"daily\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\
@@ -164,7 +166,8 @@ fn doctor_recognises_the_running_node_by_its_page() {
     let _node = start(directory.path());
     until_status(directory.path(), &[], 0);
     let output = ecod_node(directory.path()).arg("doctor").output().unwrap();
-    let (shown, said) = (text(&output.stdout), text(&output.stderr));
+    let shown = text(&output.stdout);
+    let said = text(&output.stderr);
     assert!(output.status.success(), "{shown}{said}");
     assert!(said.contains("using ecod/node.toml"), "{said}");
     assert!(shown.contains("ada runs: leading"), "{shown}");

@@ -31,7 +31,8 @@ fn album(directory: &Path, photograph: &str) -> String {
         "{}/tests/data/photos/{photograph}.jpg",
         env!("CARGO_MANIFEST_DIR")
     );
-    let (image, mut framed) = (image_codec::read(path.as_ref()).unwrap(), Mat::default());
+    let image = image_codec::read(path.as_ref()).unwrap();
+    let mut framed = Mat::default();
     copy_make_border(
         &image,
         &mut framed,

@@ -188,7 +188,8 @@ fn frames_come_at_the_times_in_the_file_and_a_pause_is_no_stall() {
     let mut source = source(&format!("kind = 'video'\npath = {path:?}"))
         .open(Duration::from_millis(300))
         .unwrap();
-    let (mut times, mut pauses) = (Vec::new(), 0);
+    let mut times = Vec::new();
+    let mut pauses = 0;
     loop {
         match source.next_frame() {
             Ok(frame) => times.push(frame.captured_at),

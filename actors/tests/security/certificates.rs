@@ -206,10 +206,8 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
 #[tokio::test]
 async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
     let mut cell = Cell::start().await;
-    let (cav, gauss) = (
-        cell.pki.issue("euclid", Role::Cav, DAY),
-        cell.pki.issue("gauss", Role::Auto, DAY),
-    );
+    let cav = cell.pki.issue("euclid", Role::Cav, DAY);
+    let gauss = cell.pki.issue("gauss", Role::Auto, DAY);
     let posing =
         ecod_actors::transport::pki::Credentials::load(&cav, &crate::fixture::node("euclid"))
             .unwrap();

@@ -71,7 +71,8 @@ fn record(leader: &NodeHandle, vehicles: [(&str, bool); 2]) -> u64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
-    let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
+    let mut pki = Pki::new();
+    let state = tempfile::tempdir().unwrap();
     let [edge_files, gauss_files, euclid_files] = [
         ("edge", Role::Edge),
         ("gauss", Role::Auto),
@@ -143,7 +144,8 @@ async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence() {
-    let (mut pki, state) = (Pki::new(), tempfile::tempdir().unwrap());
+    let mut pki = Pki::new();
+    let state = tempfile::tempdir().unwrap();
     let [edge_files, gauss_files] = [("edge", Role::Edge), ("gauss", Role::Auto)]
         .map(|(node, role)| pki.issue(node, role, DAY));
     let start_edge = || node::start(config("edge", Role::Edge, &edge_files, state.path()));

@@ -22,8 +22,10 @@ const ENDS_SOON: Duration = Duration::from_secs(61);
 
 /// Waits for maps of this leader; the longest time without any map meanwhile.
 async fn longest_gap_until(leader: &str, node: &NodeHandle) -> Duration {
-    let (start, mut newest) = (Instant::now(), node.newest_map());
-    let (mut last, mut longest) = (Instant::now(), Duration::ZERO);
+    let start = Instant::now();
+    let mut newest = node.newest_map();
+    let mut last = Instant::now();
+    let mut longest = Duration::ZERO;
     while aggregator(node).as_deref() != Some(leader) {
         assert!(start.elapsed() < SOON, "{leader} does not lead");
         if tokio::time::timeout(Duration::from_secs(5), newest.changed())

@@ -53,7 +53,8 @@ fn false_reputations(after: &GlobalMap, ahead: u64) -> Reputations {
         },
     )]
     .into();
-    let (epoch, round) = (after.epoch, after.round + ahead);
+    let epoch = after.epoch;
+    let round = after.round + ahead;
     Reputations {
         schema: SCHEMA_VERSION,
         aggregator: Some(name("edge")),
@@ -127,7 +128,8 @@ async fn rounds_in_the_leaders_name_at_the_standbys_broker_are_not_taken() {
         .log_in()
         .await
         .expect("the standby's broker trusts the other CA, too");
-    let (end, mut ahead) = (Instant::now() + ATTACK, 0);
+    let end = Instant::now() + ATTACK;
+    let mut ahead = 0;
     let maps = || [&gauss, &edge].map(|node| node.counters().events(Event::MapAccepted));
     let [taken_before, made_before] = maps();
     while Instant::now() < end {
@@ -138,7 +140,8 @@ async fn rounds_in_the_leaders_name_at_the_standbys_broker_are_not_taken() {
             .map(|newest| newest.map.as_ref().clone())
             .unwrap();
         ahead = ahead % 5 + 1;
-        let (map, reputations) = (false_map(&map, ahead), false_reputations(&map, ahead));
+        let reputations = false_reputations(&map, ahead);
+        let map = false_map(&map, ahead);
         for (topic, payload) in [
             ("global_detections", encode(&map, Encoding::Json)),
             ("reputations", encode(&reputations, Encoding::Json)),
@@ -157,7 +160,8 @@ async fn rounds_in_the_leaders_name_at_the_standbys_broker_are_not_taken() {
         sleep(Duration::from_millis(20)).await;
     }
     let [taken, made] = maps();
-    let (taken, made) = (taken - taken_before, made - made_before);
+    let taken = taken - taken_before;
+    let made = made - made_before;
     assert!(
         made > 0 && 3 * taken >= 2 * made,
         "{taken} of {made} honest maps in {ATTACK:?}"

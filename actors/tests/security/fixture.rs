@@ -102,7 +102,8 @@ impl Pki {
     /// The files in this cell of a certificate that another CA may have issued.
     pub(crate) fn files(&self, issuer: &Authority, name: &str) -> TlsConfig {
         let (certificate, key) = issuer.files_of(&node(name));
-        let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
+        let ca = self.authority.ca();
+        let list = self.authority.revocation_list();
         let city = self.city.as_ref();
         let city = city.map(|city| CityTlsConfig {
             ca: city.ca(),

@@ -30,7 +30,8 @@ fn received_by(node: &Member) -> Vec<u8> {
 /// address only.
 async fn repeat(towards: SocketAddr, relay: UdpSocket) {
     let behind = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
-    let (mut there, mut back) = ([0; 2048], [0; 2048]);
+    let mut there = [0; 2048];
+    let mut back = [0; 2048];
     let mut client = None;
     loop {
         tokio::select! {

@@ -81,7 +81,8 @@ impl Write for Log {
 #[tokio::test]
 async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next()
  {
-    let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
+    let mut pki = Pki::new();
+    let mut elsewhere = Pki::new();
     let files = pki.issue_three();
     let foreign = elsewhere.issue("edge", Role::Edge, DAY);
     let tls = client_config("gauss", &files[2]);
@@ -133,7 +134,8 @@ async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_an
 /// Its own files are in order, so that it starts, and leads where it is alone.
 #[tokio::test]
 async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_nothing() {
-    let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
+    let mut pki = Pki::new();
+    let mut elsewhere = Pki::new();
     let files = pki.issue_three();
     let [edge, euclid, gauss] = start_cell(files).await;
     edge.stop().await;
@@ -155,7 +157,8 @@ async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_
             .map_or(0, |newest| newest.map.round)
     };
     // Longer than an edge is on trial before it is handed the lead.
-    let (first, began) = (round(), Instant::now());
+    let first = round();
+    let began = Instant::now();
     sleep(Duration::from_secs(8)).await;
     let rounds = round() - first;
     let expected = began.elapsed().as_millis() as u64 / 100;

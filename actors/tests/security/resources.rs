@@ -102,7 +102,8 @@ fn shed(counters: &Counters, reason: ShedReason, source: &str) -> u64 {
 
 /// Reads packets until so many PUBLISHes have come; the result is their bytes.
 async fn read_messages(stream: &mut (impl AsyncRead + Unpin), count: usize) -> usize {
-    let (mut received, mut bytes) = (0, 0);
+    let mut received = 0;
+    let mut bytes = 0;
     while received < count {
         let first = stream.read_u8().await.unwrap();
         let mut length = 0;
@@ -115,7 +116,8 @@ async fn read_messages(stream: &mut (impl AsyncRead + Unpin), count: usize) -> u
         }
         stream.read_exact(&mut vec![0; length]).await.unwrap();
         if first & 0xf0 == 0x30 {
-            (received, bytes) = (received + 1, bytes + length);
+            received += 1;
+            bytes += length;
         }
     }
     bytes
@@ -189,7 +191,8 @@ async fn one_certificate_sends_no_more_than_its_share_and_others_do_not_wait() {
     let mut watcher = log_in(&mut cell, "edge", Role::Edge, CLEAN).await;
     subscribe(&mut watcher, "ecod/v1/lot/detections/gauss", 0).await;
     let watcher = tokio::spawn(async move {
-        let (started, mut bytes) = (Instant::now(), 0);
+        let started = Instant::now();
+        let mut bytes = 0;
         while started.elapsed() < TIME {
             bytes += timeout(SOON, read_messages(&mut watcher, 1))
                 .await
@@ -279,7 +282,8 @@ async fn two_hundred_vehicles_lose_nothing() {
     const VEHICLES: usize = 200;
     const REPORTS: usize = 20;
     let mut cell = Cell::start_with(|config| {
-        (config.connect_burst, config.handshake_timeout_ms) = (1000, 10_000);
+        config.connect_burst = 1000;
+        config.handshake_timeout_ms = 10_000;
     })
     .await;
     let mut reader = log_in(&mut cell, "gauss", Role::Auto, CLEAN).await;
@@ -290,7 +294,8 @@ async fn two_hundred_vehicles_lose_nothing() {
         let name = format!("v{n}");
         let mut vehicle = log_in(&mut cell, &name, Role::Cav, CLEAN).await;
         vehicles.spawn(async move {
-            let (report, mut ticks) = (report(&name, 2000), interval(Duration::from_millis(100)));
+            let report = report(&name, 2000);
+            let mut ticks = interval(Duration::from_millis(100));
             for _ in 0..REPORTS {
                 ticks.tick().await;
                 vehicle.write_all(&report).await.unwrap();
@@ -379,7 +384,8 @@ async fn readers_without_certificates_that_do_not_read_lose_their_own_messages_o
         subscribe(&mut reader, "flood", 0).await;
         readers.push(reader);
     }
-    let (mut leader, mut vehicle) = (connect("leader").await, connect("v01").await);
+    let mut leader = connect("leader").await;
+    let mut vehicle = connect("v01").await;
     subscribe(&mut leader, "ecod/v1/lot/detections/v01", 0).await;
     let flood = tokio::spawn(async move {
         let message = packet(0x30, &[&text("flood"), &[b'x'; 200_000]]);

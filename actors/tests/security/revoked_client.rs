@@ -24,7 +24,8 @@ fn shows(node: &NodeHandle, vehicle: &NodeName) -> bool {
 
 /// Reports two objects until the map shows them.
 async fn report_until_shown(client: &mut Client, vehicle: &NodeName, edge: &NodeHandle) {
-    let (mut ticks, mut seq) = (interval(Duration::from_millis(100)), 0);
+    let mut ticks = interval(Duration::from_millis(100));
+    let mut seq = 0;
     while !shows(edge, vehicle) {
         ticks.tick().await;
         seq += 1;

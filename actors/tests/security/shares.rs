@@ -10,7 +10,9 @@ const VOTES: u64 = 50_000;
 pub(crate) fn inverted(sender: &str, epoch: u64, aggregator: &str) -> LedgerShare {
     let name = |name: &str| NodeName::new(name).unwrap();
     let entry = |node: &str, correct, incorrect| {
-        let (aggregator, node, label) = (name(aggregator), name(node), "cup".into());
+        let aggregator = name(aggregator);
+        let node = name(node);
+        let label = "cup".into();
         LedgerEntry {
             epoch,
             aggregator,

@@ -74,7 +74,8 @@ async fn frames_without_content_count_as_what_they_take() {
         assert_eq!(answer, [0x20, 2, 0, 0]);
         let frames = frames.clone();
         floods.spawn(async move {
-            let (started, mut bytes) = (Instant::now(), 0);
+            let started = Instant::now();
+            let mut bytes = 0;
             while let Some(left) = END.checked_sub(started.elapsed())
                 && let Ok(Ok(())) = timeout(left, socket.get_mut().write_all(&frames)).await
             {

@@ -53,10 +53,8 @@ fn end_with_the_harness(work: impl Future<Output = anyhow::Result<()>>) {
         .build()
         .unwrap();
     let outcome = runtime.block_on(async {
-        let (mut interrupt, mut terminate) = (
-            signal(SignalKind::interrupt())?,
-            signal(SignalKind::terminate())?,
-        );
+        let mut interrupt = signal(SignalKind::interrupt())?;
+        let mut terminate = signal(SignalKind::terminate())?;
         tokio::select! {
             outcome = work => outcome,
             _ = interrupt.recv() => bail!("interrupted"),
@@ -73,7 +71,8 @@ async fn run_all() -> anyhow::Result<()> {
         .ok()
         .map_or(Ok(20), |text| text.parse())
         .context("TRIALS")?;
-    let (scenarios, sizes) = (filter("SCENARIOS"), filter("NODES"));
+    let scenarios = filter("SCENARIOS");
+    let sizes = filter("NODES");
     let known = |name: &String| SCENARIOS.iter().any(|scenario| scenario.name == name);
     if let Some(unknown) = scenarios.iter().flatten().find(|name| !known(name)) {
         let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
@@ -235,7 +234,8 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     }
     let flood = cell.flood_cost()?;
     // Doors first: a node has written what its door has sent.
-    let (doors, runs) = (cell.doors()?, cell.runs()?);
+    let doors = cell.doors()?;
+    let runs = cell.runs()?;
     let doors = judge_doors(&runs, &doors, &phases, cell.flooded());
     Ok(Verdict {
         reputations_changed,

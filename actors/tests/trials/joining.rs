@@ -288,7 +288,8 @@ fn init_and_invite_say_why_they_refuse() {
 
 /// A node's certificate that has ended, in place of the one that it has.
 fn let_end(pki: &Path, node: &str, role: Role, machine: &Path) {
-    let (name, day) = (NodeName::new(node).unwrap(), Duration::from_secs(86_400));
+    let name = NodeName::new(node).unwrap();
+    let day = Duration::from_secs(86_400);
     let mut authority = Authority::open(pki).unwrap();
     let issued_at = clock::wall() - 10 * day;
     authority.issue(&name, role, 9 * day, issued_at).unwrap();

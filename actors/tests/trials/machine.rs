@@ -60,7 +60,8 @@ impl Machine {
 
     /// The findings in words.
     pub(crate) fn account(&self) -> String {
-        let (withheld, delay) = (100.0 * self.most_withheld(), self.longest_delay);
+        let withheld = 100.0 * self.most_withheld();
+        let delay = self.longest_delay;
         format!(
             "{withheld:.0} % of the processors' time withheld, a sleeper late by {} ms",
             delay.as_millis()

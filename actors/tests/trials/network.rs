@@ -64,7 +64,8 @@ impl Bridged {
             &bridge('a'),
         ])?;
         for node in 0..nodes {
-            let (space, port) = (namespace(node), port(node));
+            let space = namespace(node);
+            let port = port(node);
             ip(&["netns", "add", &space])?;
             ip(&[
                 "link", "add", &port, "type", "veth", "peer", "name", "eth0", "netns", &space,
@@ -97,7 +98,8 @@ impl Bridged {
 
     /// Sends what one node has for another to a station that is not there, or sends it right again.
     pub(crate) fn cut_one_way(&self, from: usize, to: usize, cut: bool) -> anyhow::Result<()> {
-        let (space, to) = (namespace(from), address(to).to_string());
+        let space = namespace(from);
+        let to = address(to).to_string();
         let change = if cut { "replace" } else { "delete" };
         let mut arguments = vec!["-n", &space, "neigh", change, &to, "dev", "eth0"];
         if cut {

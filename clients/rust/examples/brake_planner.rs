@@ -65,11 +65,10 @@ fn distance_ahead(map: &GlobalMap, own: &NodeName, pose: WirePose) -> Option<f64
         .filter(|object| object.vehicle.as_ref().map(NodeName::vehicle).as_ref() != Some(own));
     let ahead = others.filter_map(|object| {
         let [east, north] = object.velocity_mps.unwrap_or_default();
-        let (dx, dy) = (
-            object.x_m + age_s * east - pose.x_m,
-            object.y_m + age_s * north - pose.y_m,
-        );
-        let (along, aside) = (dx * cos + dy * sin, dy * cos - dx * sin);
+        let dx = object.x_m + age_s * east - pose.x_m;
+        let dy = object.y_m + age_s * north - pose.y_m;
+        let along = dx * cos + dy * sin;
+        let aside = dy * cos - dx * sin;
         let width_m = object.size_m.map_or(0.0, |[_, width]| width);
         (along > 0.0 && aside.abs() <= HALF_WIDTH_M + width_m / 2.0).then_some(along)
     });

@@ -335,7 +335,8 @@ impl Cell {
             pose,
             moving,
         } = image;
-        let (number, captured_at_us) = (boxes.len(), micros(captured_at)?);
+        let number = boxes.len();
+        let captured_at_us = micros(captured_at)?;
         self.send_next(Topic::Boxes(self.name.clone()), number, |seq| {
             let report = BoxReport {
                 schema: SCHEMA_VERSION,
@@ -436,7 +437,8 @@ impl Cell {
         };
         let seq = sent.entry(topic).or_default();
         let payload = encoded(*seq + 1)?;
-        let (bytes, at_most) = (payload.len(), Limits::default().payload_bytes);
+        let bytes = payload.len();
+        let at_most = Limits::default().payload_bytes;
         if bytes > at_most {
             return Err(Error::Invalid(format!(
                 "not sent: {bytes} bytes with {objects} objects, at most {at_most}"
@@ -479,7 +481,8 @@ impl<M> Iterator for Messages<M> {
 
     /// Waits for the next message. After an error, iteration may continue.
     fn next(&mut self) -> Option<Self::Item> {
-        let (began, mut is_told) = (Instant::now(), false);
+        let began = Instant::now();
+        let mut is_told = false;
         let mut state = self.shared.state();
         while !state.is_closing {
             // Subscribed again after a refusal.

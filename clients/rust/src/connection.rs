@@ -272,7 +272,8 @@ impl ConnectionState {
 impl State {
     /// Records that the program is logged in.
     fn begin(&mut self, client: &Client) {
-        (self.refusal, self.client) = (None, Some(client.clone()));
+        self.refusal = None;
+        self.client = Some(client.clone());
         self.login.get_or_insert(Ok(()));
         self.asked.clear();
         self.queued.clear();

@@ -348,7 +348,8 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
     };
     assert_eq!(cell.description().unwrap().set_by.as_str(), "edge");
     // By PROJ, for 12.4 m east and 3.1 m south.
-    let (latitude_deg, longitude_deg) = (52.22964774062, 21.01241017960);
+    let latitude_deg = 52.22964774062;
+    let longitude_deg = 21.01241017960;
     let pose = GeographicPose {
         latitude_deg,
         longitude_deg,
@@ -559,13 +560,11 @@ fn what_no_cell_would_take_is_not_sent() {
         confidence: 2.0,
         ..car()
     };
-    let (good, nowhere) = (
-        car(),
-        PerceivedObject {
-            landmark: None,
-            ..car()
-        },
-    );
+    let good = car();
+    let nowhere = PerceivedObject {
+        landmark: None,
+        ..car()
+    };
     let frame = Frame::new(vec![good.clone(), wrong]);
     assert_eq!(
         said(cell.report(frame)),

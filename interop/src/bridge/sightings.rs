@@ -76,7 +76,8 @@ mod tests {
                 Timestamp(1_795_239_882_123_000),
             )
         };
-        let (start, mut sightings) = (Instant::now(), Sightings::default());
+        let start = Instant::now();
+        let mut sightings = Sightings::default();
         let after = |seconds: u64| start + Duration::from_secs(seconds);
         assert!(
             sightings.is_sighted([50.0, 0.0], start),

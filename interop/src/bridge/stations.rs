@@ -121,7 +121,8 @@ mod tests {
 
     #[test]
     fn a_receiver_with_many_stations_leaves_another_its_share() {
-        let (mut places, start) = (StationPlaces::default(), Instant::now());
+        let mut places = StationPlaces::default();
+        let start = Instant::now();
         for number in 0..12 {
             places.enter(number, &EVIL, start).unwrap();
         }
@@ -147,7 +148,8 @@ mod tests {
 
     #[test]
     fn a_station_is_of_the_receiver_that_brings_it() {
-        let (mut places, start) = (StationPlaces::default(), Instant::now());
+        let mut places = StationPlaces::default();
+        let start = Instant::now();
         places.enter(7, &HONEST, start).unwrap();
         assert_eq!(
             places.enter(7, &EVIL, start),

@@ -51,7 +51,8 @@ pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, Cp
     let position_error =
         frame.position_error(&management.reference_position.position_confidence_ellipse)?;
     let segment = management.segmentation_info.as_ref();
-    let (mut objects, mut all) = (Vec::new(), 0);
+    let mut objects = Vec::new();
+    let mut all = 0;
     for container in &message.payload.cpm_containers.0.0 {
         if container.container_id == pdu::PERCEIVED_OBJECT_CONTAINER {
             let container: PerceivedObjectContainer = uper(container.container_data.as_bytes())?;
@@ -93,14 +94,16 @@ fn perceived(
     }
     let late_s = f64::from(delta_ms) / 1000.0;
     let [east_mps, north_mps] = velocity.unwrap_or_default();
-    let (east, north) = (&object.position.x_coordinate, &object.position.y_coordinate);
+    let east = &object.position.x_coordinate;
+    let north = &object.position.y_coordinate;
     let [x_m, y_m] = frame.to_cell([
         metres(east)? - east_mps * late_s,
         metres(north)? - north_mps * late_s,
     ]);
     let covariance = frame.variances_to_cell([variance(east), variance(north)]) + position_error;
     let classes = object.classification.iter().flat_map(|classes| &classes.0);
-    let (mut scores, mut first) = (BTreeMap::<Label, f64>::new(), None);
+    let mut scores = BTreeMap::<Label, f64>::new();
+    let mut first = None;
     for class in classes {
         let label = classes::label(&class.object_class);
         first = first.or(Some(label));

@@ -52,7 +52,8 @@ pub fn encode_map(
         .iter()
         .filter(|object| is_sighted([object.x_m, object.y_m]));
     let objects = sighted.map(|object| {
-        let (age_ms, delta_ms) = (age_ms(object, map), delta_ms(object));
+        let age_ms = age_ms(object, map);
+        let delta_ms = delta_ms(object);
         (
             object.id,
             CpmObject {
@@ -125,10 +126,8 @@ pub fn encode_report(
     let station = match report.pose {
         Some(pose) => {
             let azimuth_deg = 90.0 - frame.heading_to_message(pose.heading_rad).to_degrees();
-            let (value, confidence) = (
-                cdd::Wgs84AngleValue(tenth_degrees(azimuth_deg)),
-                cdd::Wgs84AngleConfidence(127),
-            );
+            let value = cdd::Wgs84AngleValue(tenth_degrees(azimuth_deg));
+            let confidence = cdd::Wgs84AngleConfidence(127);
             let vehicle = OriginatingVehicleContainer::new(
                 cdd::Wgs84Angle { value, confidence },
                 None,
@@ -184,10 +183,8 @@ impl<'a> CpmObject<'a> {
     /// The object in a message's form, at the place of its last detection; `None` if that is too
     /// far from the reference position.
     fn perceived(&self, frame: &MessageFrame) -> Option<cdd::PerceivedObject> {
-        let ([x_m, y_m], [east_mps, north_mps]) = (
-            self.object.position_m,
-            self.object.velocity_mps.unwrap_or_default(),
-        );
+        let [x_m, y_m] = self.object.position_m;
+        let [east_mps, north_mps] = self.object.velocity_mps.unwrap_or_default();
         let delta_s = f64::from(self.delta_ms) / 1000.0;
         let [east_m, north_m] =
             frame.to_message(x_m + east_mps * delta_s, y_m + north_mps * delta_s);

@@ -58,7 +58,8 @@ impl MessageFrame {
         cell: &GeographicOrigin,
         position: &cdd::ReferencePosition,
     ) -> Result<Self, CpmError> {
-        let (latitude, longitude) = (position.latitude.0, position.longitude.0);
+        let latitude = position.latitude.0;
+        let longitude = position.longitude.0;
         if latitude == NO_LATITUDE || longitude == NO_LONGITUDE {
             return Err(CpmError::NoPosition);
         }
@@ -68,7 +69,8 @@ impl MessageFrame {
         } else {
             f64::from(altitude) / 100.0
         };
-        let (latitude_deg, longitude_deg) = (f64::from(latitude) / 1e7, f64::from(longitude) / 1e7);
+        let latitude_deg = f64::from(latitude) / 1e7;
+        let longitude_deg = f64::from(longitude) / 1e7;
         Self::new(
             cell,
             GeographicPosition {
@@ -87,10 +89,8 @@ impl MessageFrame {
         &self,
         ellipse: &cdd::PosConfidenceEllipse,
     ) -> Result<Covariance, CpmError> {
-        let (major, minor) = (
-            ellipse.semi_major_confidence.0,
-            ellipse.semi_minor_confidence.0,
-        );
+        let major = ellipse.semi_major_confidence.0;
+        let minor = ellipse.semi_minor_confidence.0;
         if major == WIDE_AXIS || minor == WIDE_AXIS {
             return Err(CpmError::NoPosition);
         }

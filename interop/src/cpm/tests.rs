@@ -242,7 +242,8 @@ proptest! {
             // The reference position's own error is unavailable; values above 41 m are only limited
             // from below.
             let [xx, xy, yy] = other.covariance_m2.unwrap();
-            let (own, wide) = ((5.0_f64 / 2.4477).powi(2), (40.95 / SIGMAS).powi(2));
+            let own = (5.0_f64 / 2.4477).powi(2);
+            let wide = (40.95 / SIGMAS).powi(2);
             let variance = object.covariance_m2.map_or((10.0 / SIGMAS).powi(2), |[variance, ..]| variance).min(wide);
             let coarser = (variance.sqrt() + 0.01 / SIGMAS).powi(2) + own + 1e-6;
             prop_assert!(xx >= variance + own - 1e-6 && yy >= variance + own - 1e-6, "no certainty is gained");
@@ -307,11 +308,10 @@ fn an_object_keeps_its_number_and_two_never_share_one() {
 #[test]
 fn a_node_has_the_same_station_number_in_every_run() {
     let numbers = || StationIds::new(NodeName::from_static("lot-1"));
-    let (euclid, gauss) = (
-        NodeName::from_static("euclid"),
-        NodeName::from_static("gauss"),
-    );
-    let (mut one, mut other) = (numbers(), numbers());
+    let euclid = NodeName::from_static("euclid");
+    let gauss = NodeName::from_static("gauss");
+    let mut one = numbers();
+    let mut other = numbers();
     let now = Instant::now();
     let of_gauss = one.of(&gauss, now).unwrap();
     assert_ne!(of_gauss, one.of(&euclid, now).unwrap());
@@ -683,10 +683,8 @@ fn parts_that_report_received_messages_are_told_from_others() {
 
 #[test]
 fn there_are_station_numbers_for_so_many_names_that_are_heard() {
-    let (mut numbers, start) = (
-        StationIds::new(NodeName::from_static("lot-1")),
-        Instant::now(),
-    );
+    let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
+    let start = Instant::now();
     let name = |index: u32| NodeName::new(format!("node-{index}")).unwrap();
     let all: BTreeSet<_> = (0..4096)
         .map(|index| numbers.of(&name(index), start).unwrap())
@@ -708,10 +706,8 @@ fn there_are_station_numbers_for_so_many_names_that_are_heard() {
 
 #[test]
 fn a_vehicle_that_invents_parts_takes_no_others_numbers() {
-    let (mut numbers, now) = (
-        StationIds::new(NodeName::from_static("lot-1")),
-        Instant::now(),
-    );
+    let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
+    let now = Instant::now();
     let part = |index: u32| NodeName::new(format!("evil--{index}")).unwrap();
     assert_eq!(
         (0..500)

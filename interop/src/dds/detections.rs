@@ -190,7 +190,8 @@ impl RosCamera {
         objects: impl Iterator<Item = Result<PerceivedObject, RefusedInput>>,
     ) -> Placed {
         let captured_at = SystemTime::UNIX_EPOCH + Duration::from_micros(captured_at.micros());
-        let (mut placed, mut refused) = (Vec::new(), Vec::new());
+        let mut placed = Vec::new();
+        let mut refused = Vec::new();
         for object in objects {
             match object {
                 Ok(object) => match object.check_fields() {
@@ -317,16 +318,21 @@ pub(super) fn place_in_pictures(
     let objects = detections.detections.iter().map(|detection| {
         let PerceivedObject { label, confidence, scores, .. } = camera.unplaced(&detection.results)?;
         let bounds = &detection.bbox;
-        let (x, y) = (bounds.center.position.x, bounds.center.position.y);
+        let x = bounds.center.position.x;
+        let y = bounds.center.position.y;
         // The upright box around a rotated one.
         let (sin, cos) = bounds.center.theta.sin_cos();
         let half_width = ((bounds.size_x * cos).abs() + (bounds.size_y * sin).abs()) / 2.0;
         let half_height = ((bounds.size_x * sin).abs() + (bounds.size_y * cos).abs()) / 2.0;
-        let (x_min, x_max, y_min, y_max) = (x - half_width, x + half_width, y - half_height, y + half_height);
+        let x_min = x - half_width;
+        let x_max = x + half_width;
+        let y_min = y - half_height;
+        let y_max = y + half_height;
         let bounding_box = BoundingBox { x_min, y_min, x_max, y_max };
         let detection = Detection { label, confidence, bounding_box, corners: None };
         let of_box = |what: &dyn Display| {
-            let (width, height) = (intrinsics.width, intrinsics.height);
+            let width = intrinsics.width;
+            let height = intrinsics.height;
             format!("{what}, ({x_min:.1}, {y_min:.1}) to ({x_max:.1}, {y_max:.1}) in {width}x{height} pixels")
         };
         if !(0.0..=f64::from(intrinsics.width)).contains(&x) || !(0.0..=f64::from(intrinsics.height)).contains(&y) {
@@ -349,20 +355,15 @@ impl CameraInfo {
         } else {
             (raw_fx, raw_fy, raw_cx, raw_cy)
         };
-        let (columns, rows) = (self.binning_x.max(1), self.binning_y.max(1));
+        let columns = self.binning_x.max(1);
+        let rows = self.binning_y.max(1);
         let of_region = |part: u32, whole: u32| if part > 0 { part } else { whole };
-        let (width, height) = (
-            of_region(self.roi.width, self.width) / columns,
-            of_region(self.roi.height, self.height) / rows,
-        );
-        let (fx, cx) = (
-            fx / f64::from(columns),
-            (cx - f64::from(self.roi.x_offset)) / f64::from(columns),
-        );
-        let (fy, cy) = (
-            fy / f64::from(rows),
-            (cy - f64::from(self.roi.y_offset)) / f64::from(rows),
-        );
+        let width = of_region(self.roi.width, self.width) / columns;
+        let height = of_region(self.roi.height, self.height) / rows;
+        let fx = fx / f64::from(columns);
+        let cx = (cx - f64::from(self.roi.x_offset)) / f64::from(columns);
+        let fy = fy / f64::from(rows);
+        let cy = (cy - f64::from(self.roi.y_offset)) / f64::from(rows);
         let is_usable =
             fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && width > 0 && height > 0;
         let unusable = || {

@@ -79,7 +79,10 @@ fn detection(object: &CellObject<'_>, existence: f64, header: &Header, id: Strin
     if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) =
         (object.covariance_m2, &mut covariance)
     {
-        (*a, *b, *c, *d) = (xx, xy, xy, yy);
+        *a = xx;
+        *b = xy;
+        *c = xy;
+        *d = yy;
     }
     let weighted = object
         .scores

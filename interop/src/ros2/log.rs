@@ -113,7 +113,8 @@ impl<W: Write + Seek> RosLog<W> {
             .with_skip_end_magic(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
         let mut reader = LinearReader::new_with_options(options);
-        let (mut topics, mut is_complete) = (HashMap::<u16, String>::new(), false);
+        let mut topics = HashMap::<u16, String>::new();
+        let mut is_complete = false;
         while let Some(event) = reader.next_event() {
             let record = match event {
                 Ok(LinearReadEvent::ReadRequest(wanted)) => {

@@ -100,20 +100,18 @@ impl MarkerArray {
                 z: 0.5,
                 ..RosVector::default()
             };
-            let (box_color, color) = (
-                ColorRGBA {
-                    r: 0.2,
-                    g: 0.6,
-                    b: 1.0,
-                    a,
-                },
-                ColorRGBA {
-                    r: 1.0,
-                    g: 1.0,
-                    b: 1.0,
-                    a,
-                },
-            );
+            let box_color = ColorRGBA {
+                r: 0.2,
+                g: 0.6,
+                b: 1.0,
+                a,
+            };
+            let color = ColorRGBA {
+                r: 1.0,
+                g: 1.0,
+                b: 1.0,
+                a,
+            };
             let text = object.label.to_string();
             markers.push(Marker {
                 pose,

@@ -37,7 +37,8 @@ impl TFMessage {
             y: pose.y_m,
             z: pose.height_m.unwrap_or(0.0),
         };
-        let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
+        let roll_rad = pose.roll_rad.unwrap_or(0.0);
+        let pitch_rad = pose.pitch_rad.unwrap_or(0.0);
         let transform = Transform {
             translation,
             rotation: RosQuaternion::of(roll_rad, pitch_rad, pose.heading_rad),

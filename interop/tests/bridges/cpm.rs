@@ -75,7 +75,8 @@ impl Edge {
     fn describe(&self, text: &str) {
         let (client, mut connection) = self.stranger("operator");
         std::thread::spawn(move || connection.iter().for_each(drop));
-        let (hash, set_by) = (ContentHash([0; 32]), NodeName::from_static("edge"));
+        let hash = ContentHash([0; 32]);
+        let set_by = NodeName::from_static("edge");
         let description = CellDescription {
             schema: 1,
             version: 0,
@@ -208,7 +209,8 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
             ))
         })
     });
-    let (mut of_map, mut of_vehicle) = (None::<ReceivedCpm>, None::<ReceivedCpm>);
+    let mut of_map = None::<ReceivedCpm>;
+    let mut of_vehicle = None::<ReceivedCpm>;
     let echo = (NodeName::from_static("echo"), CpmRefusal::Own);
     let mut bus = None;
     let mut of_bus = Some(of_bus);
@@ -245,7 +247,9 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
             break;
         }
     }
-    let (map, vehicle, (_, bus)) = (of_map.unwrap(), of_vehicle.unwrap(), bus.unwrap());
+    let map = of_map.unwrap();
+    let vehicle = of_vehicle.unwrap();
+    let (_, bus) = bus.unwrap();
     assert_ne!(map.station_id, vehicle.station_id);
     assert!(
         (bus.x_m - 12.0).abs() < 0.5 && (bus.y_m + 3.0).abs() < 0.5,
@@ -339,7 +343,9 @@ fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
     let of_edge = StationIds::new(NodeName::from_static("lot-1"))
         .of(&NodeName::from_static("edge"), Instant::now())
         .unwrap();
-    let (began, mut stations, mut of_euclid) = (Instant::now(), BTreeSet::new(), 0);
+    let began = Instant::now();
+    let mut stations = BTreeSet::new();
+    let mut of_euclid = 0;
     for event in connection.iter() {
         assert!(began.elapsed() < SOON, "{stations:?} {of_euclid}");
         let Ok(Event::Incoming(Incoming::Publish(message))) = event else {
@@ -386,11 +392,10 @@ fn with_certificates_a_program_of_the_node_publishes_cpms() {
     let files = authority.tls_of(&name);
     let client = Tls::of_door(files.ca.clone(), &files.certificate, &files.key);
     let edge = Edge::start(Some((files, client)));
-    let (sender, reader) = (
-        Cell::connect(edge.settings.clone()),
-        Cell::connect(edge.settings.clone()),
-    );
-    let (sender, reader) = (sender.unwrap(), reader.unwrap());
+    let sender = Cell::connect(edge.settings.clone());
+    let reader = Cell::connect(edge.settings.clone());
+    let sender = sender.unwrap();
+    let reader = reader.unwrap();
     let began = Instant::now();
     let mut received = reader.received_cpms().timeout(Duration::from_millis(100));
     let message = loop {

@@ -32,7 +32,8 @@ fn log(directory: &Path) -> Vec<u8> {
     };
     let runtime = Runtime::new().unwrap();
     let handle = runtime.block_on(node::start(config)).unwrap();
-    let (broker, cell) = (handle.listens_at().unwrap().to_string(), "lot-1".into());
+    let broker = handle.listens_at().unwrap().to_string();
+    let cell = "lot-1".into();
     let settings = Settings {
         broker,
         cell,
@@ -41,7 +42,8 @@ fn log(directory: &Path) -> Vec<u8> {
         ..Settings::default()
     };
     let vehicle = Cell::connect(settings).unwrap();
-    let (began, mut with_car) = (Instant::now(), 0);
+    let began = Instant::now();
+    let mut with_car = 0;
     for map in vehicle.maps() {
         with_car += usize::from(
             map.unwrap()
@@ -212,10 +214,8 @@ fn a_picture_of_the_camera_is_the_same_picture_and_has_its_optics() {
 #[test]
 fn what_is_no_log_leaves_no_output_in_the_way_of_the_next_try() {
     let directory = tempfile::tempdir().unwrap();
-    let (log, output) = (
-        directory.path().join("log.mcap"),
-        directory.path().join("ros2.mcap"),
-    );
+    let log = directory.path().join("log.mcap");
+    let output = directory.path().join("ros2.mcap");
     let run = || {
         let program = Command::new(env!("CARGO_BIN_EXE_ecod-interop"))
             .arg("ros2")

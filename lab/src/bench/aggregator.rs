@@ -40,7 +40,8 @@ impl OwnAggregator {
         let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
         fs::create_dir_all(&directory)
             .with_context(|| format!("cannot make {}", directory.display()))?;
-        let (broker, page) = (free_address()?, free_address()?);
+        let broker = free_address()?;
+        let page = free_address()?;
         let mut config = NodeConfig {
             name: Some(NodeName::from_static("edge")),
             cell: NodeName::from_static("bench"),

@@ -318,7 +318,9 @@ async fn report(
     let poll = tokio::spawn(async move { while events.poll().await.is_ok() {} });
     let mut ticks = tokio::time::interval(PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
-    let (begun, mut sent, mut seq) = (Instant::now(), Vec::new(), 0);
+    let begun = Instant::now();
+    let mut sent = Vec::new();
+    let mut seq = 0;
     while begun.elapsed() < WARM_UP + duration {
         ticks.tick().await;
         seq += 1;
@@ -341,7 +343,8 @@ async fn report(
     }
     sleep(LAST_MAP).await;
     poll.abort();
-    let (maps, mut latencies) = (watcher.maps(), Latencies::default());
+    let maps = watcher.maps();
+    let mut latencies = Latencies::default();
     for captured_at in sent {
         // The leader's estimate of a clock is not exact to the microsecond.
         let rests_on = |map: &&DoorArrival| {
@@ -431,7 +434,8 @@ mod tests {
                 missing: 0,
             };
             let report_at_door = Quantiles { missing, ..way };
-            let (behind_node, report_at_leader) = (way, way);
+            let behind_node = way;
+            let report_at_leader = way;
             let figures = DoorFigures {
                 behind_node,
                 report_at_door,

@@ -49,7 +49,8 @@ pub(super) fn drive(
         .max(1);
     for tick in 0..load.ticks() {
         let payload = |(report, topic): &mut (ObjectReport, String)| {
-            (report.seq, report.captured_at_us) = (tick.into(), schedule.captured_at(tick));
+            report.seq = tick.into();
+            report.captured_at_us = schedule.captured_at(tick);
             target.access.seal(topic, encode(report, target.encoding))
         };
         let payloads: Vec<Vec<Vec<u8>>> = senders

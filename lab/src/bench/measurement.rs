@@ -80,7 +80,8 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
         }
         false => None,
     };
-    let (mut vehicles, mut senders) = (Vec::new(), Vec::new());
+    let mut vehicles = Vec::new();
+    let mut senders = Vec::new();
     for index in 0..load.vehicles {
         let report = load::report(index, &target.landmarks);
         let id = format!("ecod-bench-{}", report.node);
@@ -157,7 +158,8 @@ async fn gather(vehicles: &[BenchVehicle], schedule: Schedule, load: Load) -> (A
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     let waited_until = Instant::now();
-    let (mut cell, mut bare) = (Answers::default(), Answers::default());
+    let mut cell = Answers::default();
+    let mut bare = Answers::default();
     for vehicle in vehicles {
         let arrivals = vehicle
             .arrivals

@@ -53,7 +53,8 @@ async fn body(page: SocketAddr, path: &str, end: Option<&[u8]>) -> anyhow::Resul
         let request =
             format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
         stream.write_all(request.as_bytes()).await?;
-        let (mut answer, mut head) = (Vec::new(), None);
+        let mut answer = Vec::new();
+        let mut head = None;
         while stream.read_buf(&mut answer).await? > 0 {
             head = head.or_else(|| place(&answer, b"\r\n\r\n"));
             let ended = |head: usize| end.is_some_and(|end| place(&answer[head..], end).is_some());

@@ -242,7 +242,8 @@ mod tests {
 
     fn step(refused: u64, sent_late_ms: f64, shares: Shares) -> Step {
         let map = Latencies::default().quantiles();
-        let (map_bytes, verdict_bytes) = (0, 0);
+        let map_bytes = 0;
+        let verdict_bytes = 0;
         Step {
             vehicles: 4,
             carried: false,

@@ -242,7 +242,8 @@ mod tests {
 
     #[test]
     fn a_map_and_verdicts_in_any_encoding_tell_their_round_and_what_they_rest_on() {
-        let (largest, fused_at) = (u64::MAX >> 11, Timestamp(1_732_154_400_200_000));
+        let largest = u64::MAX >> 11;
+        let fused_at = Timestamp(1_732_154_400_200_000);
         let epoch = Epoch::new(largest, NodeName::from_static("edge"));
         let oldest_capture_us = Some(Timestamp(1_732_154_400_123_456));
         let mut map = GlobalMap {

@@ -136,10 +136,8 @@ const SEARCH_SPAN: Duration = Duration::from_secs(4);
 pub(super) fn run(arguments: &BenchArguments) -> Result<(), Failure> {
     let runtime = tokio::runtime::Runtime::new().context("no threads for the vehicles")?;
     Ok(runtime.block_on(async {
-        let (mut interrupt, mut terminate) = (
-            signal(SignalKind::interrupt())?,
-            signal(SignalKind::terminate())?,
-        );
+        let mut interrupt = signal(SignalKind::interrupt())?;
+        let mut terminate = signal(SignalKind::terminate())?;
         tokio::select! {
             outcome = bench(arguments) => outcome,
             _ = interrupt.recv() => bail!("interrupted"),
@@ -230,7 +228,8 @@ impl BenchArguments {
         let votes =
             config.fusion.algorithms.vote() && config.fusion.vote.mode == VoteMode::Weighted;
         let cell = self.cell.clone().unwrap_or(config.cell);
-        let (landmarks, encoding) = (config.landmarks, config.mqtt.encoding);
+        let landmarks = config.landmarks;
+        let encoding = config.mqtt.encoding;
         Ok(Some(Target {
             access,
             cell,
@@ -267,7 +266,8 @@ async fn compare(
                 Duration::from_secs(arguments.seconds) / PASSES as u32,
             )
         };
-        let (mut cell, mut bare) = (Answers::default(), Answers::default());
+        let mut cell = Answers::default();
+        let mut bare = Answers::default();
         let mut last = None;
         for _ in 0..PASSES {
             let measured = measure(target, load).await?;
@@ -317,7 +317,8 @@ async fn compare(
 
 impl Ways {
     fn of(cell: &Latencies, bare: &Latencies) -> Self {
-        let (cell, bare) = (cell.quantiles(), bare.quantiles());
+        let cell = cell.quantiles();
+        let bare = bare.quantiles();
         Self {
             cell,
             bare,
@@ -427,7 +428,8 @@ async fn costs(
         votes: false,
         ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds))
     };
-    let (mut usages, mut looked) = (Vec::new(), None);
+    let mut usages = Vec::new();
+    let mut looked = None;
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
         let measured = measure(aggregator.target()?, load).await?;
@@ -465,10 +467,8 @@ async fn costs(
         5.0,
     );
     let looked = looked.context("nobody looked")?;
-    let (page_kb, first_picture_ms) = (
-        looked.bytes as f64 / 1e3,
-        looked.first_picture.as_secs_f64() * 1e3,
-    );
+    let page_kb = looked.bytes as f64 / 1e3;
+    let first_picture_ms = looked.first_picture.as_secs_f64() * 1e3;
     print(&format!(
         "its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"
     ))?;

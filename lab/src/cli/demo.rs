@@ -211,7 +211,9 @@ fn tell(progress: Progress) -> anyhow::Result<()> {
 fn leaders(terms: &[JudgedTerm], start: Timestamp, judged: &str) -> String {
     let line = |term: &JudgedTerm| {
         let since = |time: Timestamp| time.since(start).as_secs_f64();
-        let (leader, from, until) = (&term.epoch.leader, since(term.from), since(term.until));
+        let leader = &term.epoch.leader;
+        let from = since(term.from);
+        let until = since(term.until);
         let gap = term.gap.map_or_else(String::new, |gap| {
             format!(
                 ", first map {} ms after the last one before (for the vehicle that waited longest)",
@@ -263,10 +265,8 @@ fn street_table(street: &StreetResult) -> String {
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.
 async fn until_signalled<T>(scene: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
-    let (mut interrupt, mut terminate) = (
-        signal(SignalKind::interrupt())?,
-        signal(SignalKind::terminate())?,
-    );
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
     tokio::select! {
         outcome = scene => outcome,
         _ = interrupt.recv() => bail!("interrupted"),

@@ -64,7 +64,8 @@ pub(super) fn run(arguments: &EvalLabelsArguments) -> Result<(), Failure> {
             set.replaced
         );
     }
-    let (mut online, mut refined) = (Vec::new(), Vec::new());
+    let mut online = Vec::new();
+    let mut refined = Vec::new();
     let mut decisions = Vec::new();
     for seed in 1..=arguments.orders {
         let [in_order, after_passes] = set.vote(&config, seed, arguments.passes);

@@ -39,7 +39,8 @@ pub(super) fn judged_terms<'a>(
                 .filter(|(last, _)| *last != epoch)
                 .map(|(_, at)| received_at.since(at));
             let (term, rounds) = terms.entry(epoch.clone()).or_insert_with(|| {
-                let (from, until) = (*received_at, *received_at);
+                let from = *received_at;
+                let until = *received_at;
                 (
                     JudgedTerm {
                         epoch: epoch.clone(),
@@ -100,7 +101,8 @@ mod tests {
         ];
         let terms = judged_terms([&quick[..], &slow[..]], |maps| maps.len() as f64);
         let told = |term: &JudgedTerm| {
-            let (from, until) = (term.from.micros() / 1000, term.until.micros() / 1000);
+            let from = term.from.micros() / 1000;
+            let until = term.until.micros() / 1000;
             (
                 term.epoch.to_string(),
                 from,

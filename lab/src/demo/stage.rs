@@ -217,7 +217,8 @@ async fn watch(
     let vehicles = nodes.len() - 1;
     while collector.reporters() < vehicles || collector.leader().as_ref() != Some(edge) {
         if clock::now().since(started) > START_TIMEOUT {
-            let (reporters, leader) = (collector.reporters(), collector.leader());
+            let reporters = collector.reporters();
+            let leader = collector.leader();
             let leader = leader.map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
             bail!(
                 "after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads"
@@ -234,12 +235,14 @@ async fn watch(
         until: from,
         killed_at: None,
     };
-    let (kill_at, restart_at) = (from + duration / 2, from + duration / 2 + EDGE_GONE);
+    let kill_at = from + duration / 2;
+    let restart_at = from + duration / 2 + EDGE_GONE;
     let mut next_progress = from;
     while clock::now().since(from) < duration {
         tokio::time::sleep(Duration::from_millis(50)).await;
         check(nodes)?;
-        let (now, edge) = (clock::now(), &mut nodes[0]);
+        let now = clock::now();
+        let edge = &mut nodes[0];
         let tell = |news| {
             progress(Progress {
                 elapsed: now.since(from),

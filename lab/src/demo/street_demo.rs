@@ -417,7 +417,10 @@ impl Judge<'_> {
 
     /// Knowledge of a node that received these maps.
     fn share(&self, maps: &[ReceivedMap]) -> KnownShare {
-        let (mut frames, mut at, mut next, mut ids) = (Vec::new(), self.from, 0, HashMap::new());
+        let mut frames = Vec::new();
+        let mut at = self.from;
+        let mut next = 0;
+        let mut ids = HashMap::new();
         while at <= self.until {
             next += maps[next..]
                 .iter()
@@ -524,7 +527,8 @@ mod tests {
                     // corners.
                     let allowed_m = 0.8
                         + 0.05 * nalgebra::distance(&place, &street.pose(camera, at_s).position);
-                    let (name, label) = (&camera.name, &object.label);
+                    let name = &camera.name;
+                    let label = &object.label;
                     assert!(
                         error_m < allowed_m,
                         "{name} places a {label} {error_m:.2} m off at {at_s} s"

@@ -128,7 +128,8 @@ impl NearestTracker {
             }
         }
         pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let (mut continued, mut ids) = (vec![false; self.tracks.len()], vec![None; found.len()]);
+        let mut continued = vec![false; self.tracks.len()];
+        let mut ids = vec![None; found.len()];
         for (_, number, place) in pairs {
             if !continued[number] && ids[place].is_none() {
                 continued[number] = true;
@@ -171,7 +172,8 @@ impl NearestTrack {
         if passed_s > 0.0 {
             self.velocity += ((position - self.position) / passed_s - self.velocity) * GAIN;
         }
-        (self.position, self.at) = (position, at);
+        self.position = position;
+        self.at = at;
         self.id
     }
 }

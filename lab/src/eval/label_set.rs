@@ -330,7 +330,8 @@ impl LabelSetReader {
     /// Truths of items without answers are left out.
     fn read_truths(&mut self, text: &str) -> Result<(), LabelSetError> {
         let mut table = Table::new(text)?;
-        let (item_column, truth_column) = (table.column("item")?, table.column("truth")?);
+        let item_column = table.column("item")?;
+        let truth_column = table.column("truth")?;
         while let Some((line, row)) = table.next_row()? {
             let name = row.get(item_column).unwrap_or_default();
             let truth = row.get(truth_column).unwrap_or_default();

@@ -163,7 +163,8 @@ fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
         Evaluation::new(truth).with_landmarks(LandmarkIndex::new(vec![ball], 0.5), gate);
     let mut unnamed = report("v", 1, &[("", "vase"), ("", "vase")]);
     for (object, x_m) in unnamed.objects.iter_mut().zip([1.1, 3.0]) {
-        (object.landmark, object.x_m) = (None, x_m);
+        object.landmark = None;
+        object.x_m = x_m;
     }
     evaluation.report(ReportKind::Detections, &unnamed);
     let pace = evaluation.result().pace.unwrap();

@@ -343,7 +343,10 @@ impl TrackEvaluation {
                     idf1_pct: None,
                     ..*at
                 };
-                (at.hota_pct, at.deta_pct, at.assa_pct, at.loca_pct) = (None, None, None, None);
+                at.hota_pct = None;
+                at.deta_pct = None;
+                at.assa_pct = None;
+                at.loca_pct = None;
             }
         }
         scores

@@ -58,7 +58,8 @@ impl Votes {
     }
 
     pub(super) fn majority_accuracy_pct(&self, truth: &Truth) -> Option<f64> {
-        let (mut all, mut right) = (0, 0.0);
+        let mut all = 0;
+        let mut right = 0.0;
         for (id, number, span) in truth.spans() {
             all += 1;
             let mut sums = Ballot::new();
@@ -86,7 +87,9 @@ impl Votes {
     }
 
     pub(super) fn vehicles(&self, truth: &Truth) -> BTreeMap<NodeName, VehicleScores> {
-        let (mut all, mut standing, mut free) = (0, 0, 0);
+        let mut all = 0;
+        let mut standing = 0;
+        let mut free = 0;
         for (_, _, span) in truth.spans() {
             all += 1;
             *(if truth.accepts(span, None) {

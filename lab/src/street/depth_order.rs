@@ -61,10 +61,8 @@ mod tests {
     fn a_long_van_hides_a_pedestrian_whose_middle_is_nearer() {
         // Seen along the van: its middle is farther away than the pedestrian behind its tail.
         let eye = Point2::new(-10.0, -1.5);
-        let (van, pedestrian) = (
-            rectangle(0.0, 0.0, 12.0, 2.0),
-            rectangle(-3.0, 1.5, 0.5, 0.5),
-        );
+        let van = rectangle(0.0, 0.0, 12.0, 2.0);
+        let pedestrian = rectangle(-3.0, 1.5, 0.5, 0.5);
         assert!((middle(&pedestrian) - eye).norm() < (middle(&van) - eye).norm());
         assert_eq!(depth_order(&eye, &[van, pedestrian]), [1, 0]);
         assert_eq!(

@@ -133,7 +133,8 @@ impl Shooting {
     fn run(self, ended: &AtomicBool) -> anyhow::Result<()> {
         let camera: &StreetCamera = &self.street.cameras[self.number];
         let mut sensor = None;
-        let (mut frame, mut takes) = (0, Duration::ZERO);
+        let mut frame = 0;
+        let mut takes = Duration::ZERO;
         while !ended.load(Ordering::Relaxed) {
             let began = clock::now();
             // A machine that is too slow shows fewer pictures, each at its time.

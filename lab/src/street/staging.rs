@@ -160,7 +160,8 @@ fn van(route: Route, color: [f64; 3]) -> StreetBody {
 }
 
 fn person(route: Route, color: [f64; 3]) -> StreetBody {
-    let (trousers, skin) = ([80.0, 60.0, 50.0], [140.0, 170.0, 215.0]);
+    let trousers = [80.0, 60.0, 50.0];
+    let skin = [140.0, 170.0, 215.0];
     let shoulders_m = 0.75 + PERSON_PLACARD_M;
     let solids = vec![
         solid([0.0, 0.3, 0.42], [0.0, 0.62], trousers),

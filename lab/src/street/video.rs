@@ -20,7 +20,8 @@ const FRAMES: u32 = 100;
 /// # Errors
 /// Returns an error if OpenCV has no encoder for it, or the file cannot be written.
 pub(crate) fn write(street: &Street, camera: &StreetCamera, file: &Path) -> anyhow::Result<()> {
-    let (view, optics) = (StreetView::new(street)?, Street::optics());
+    let view = StreetView::new(street)?;
+    let optics = Street::optics();
     let size = Size::new(optics.width.cast_signed(), optics.height.cast_signed());
     let name = file.to_str().context("the path is no UTF-8")?;
     let mut writer = VideoWriter::new(

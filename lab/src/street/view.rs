@@ -85,10 +85,8 @@ impl StreetView {
         camera: &StreetCamera,
         at_s: f64,
     ) -> opencv::Result<Mat> {
-        let (rows, columns) = (
-            self.optics.height.cast_signed(),
-            self.optics.width.cast_signed(),
-        );
+        let rows = self.optics.height.cast_signed();
+        let columns = self.optics.width.cast_signed();
         let image = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, scalar(SKY, 1.0))?;
         let sight = StreetSight::new(street.pose(camera, at_s), &camera.mount);
         let mut canvas = Canvas {
@@ -149,10 +147,8 @@ fn print(label: &Label) -> anyhow::Result<Mat> {
     )?;
     for (place, color) in code.to_colors().into_iter().enumerate() {
         if color == Color::Dark {
-            let (row, column) = (
-                place / CODE_MODULES + QUIET_MODULES,
-                place % CODE_MODULES + QUIET_MODULES,
-            );
+            let row = place / CODE_MODULES + QUIET_MODULES;
+            let column = place % CODE_MODULES + QUIET_MODULES;
             *print.at_2d_mut(row as i32, column as i32)? = opencv::core::Vec3b::from([32, 30, 31]);
         }
     }
@@ -168,7 +164,8 @@ struct StreetSight {
 
 impl StreetSight {
     fn new(pose: Pose, mount: &Mount) -> Self {
-        let (pose, height_m) = (mount.camera_pose(&pose), mount.height_m.unwrap_or_default());
+        let pose = mount.camera_pose(&pose);
+        let height_m = mount.height_m.unwrap_or_default();
         Self {
             pose,
             height_m,
@@ -228,7 +225,8 @@ impl Canvas<'_> {
             self.fill(&face, scalar(solid.color, 1.08))?;
         }
         for side in 0..4 {
-            let (right, left) = (corners[side], corners[(side + 1) % 4]);
+            let right = corners[side];
+            let left = corners[(side + 1) % 4];
             // Counter-clockwise corners: outside is to the right.
             let out = Vector2::new(left.y - right.y, right.x - left.x);
             if (self.sight.pose.position - right).dot(&out) <= 0.0 {
@@ -291,10 +289,8 @@ impl Canvas<'_> {
                 .clamp(0.0, f64::from(end));
             (low as i32, (high - low) as i32)
         };
-        let ((x, width), (y, height)) = (
-            bounds(|p| p.x, self.image.cols()),
-            bounds(|p| p.y, self.image.rows()),
-        );
+        let (x, width) = bounds(|p| p.x, self.image.cols());
+        let (y, height) = bounds(|p| p.y, self.image.rows());
         if width == 0 || height == 0 {
             return Ok(());
         }

@@ -219,8 +219,8 @@ impl BirdseyePicture<'_> {
             .iter()
             .filter(|spot| spot.truth.is_some())
             .filter_map(|spot| {
-                let ((x1, y1), (x2, y2)) =
-                    (self.sheet.at(&spot.empty?), self.sheet.at(&spot.occupied));
+                let (x1, y1) = self.sheet.at(&spot.empty?);
+                let (x2, y2) = self.sheet.at(&spot.occupied);
                 Some(line(x1, y1, x2, y2))
             });
         let width = self.sheet.length(self.testbed.placard.card_width_m);
@@ -288,11 +288,9 @@ impl BirdseyePicture<'_> {
                 };
                 self.sheet.at(&pose.transform(range_m, 0.0))
             };
-            let ((x, y), (x1, y1), (x2, y2)) = (
-                self.sheet.at(&cav.pose.position),
-                edge(half_rad),
-                edge(-half_rad),
-            );
+            let (x, y) = self.sheet.at(&cav.pose.position);
+            let (x1, y1) = edge(half_rad);
+            let (x2, y2) = edge(-half_rad);
             let radius = round(self.sheet.length(range_m));
             let [x, y, x1, y1, x2, y2] = [x, y, x1, y1, x2, y2].map(round);
             let outline = format!("M{x} {y}L{x1} {y1}A{radius} {radius} 0 0 1 {x2} {y2}Z");
@@ -345,7 +343,8 @@ impl BirdseyePicture<'_> {
         let mut group = Group::new();
         for (cav, color) in self.vehicles() {
             let (x, y) = self.sheet.at(&cav.pose.position);
-            let (ahead, aside) = (0.75 * METRES_PER_INCH, 0.45 * METRES_PER_INCH);
+            let ahead = 0.75 * METRES_PER_INCH;
+            let aside = 0.45 * METRES_PER_INCH;
             let corners =
                 [(ahead, 0.0), (-aside, aside), (-aside, -aside)].map(|(forward_m, left_m)| {
                     let (x, y) = self.sheet.at(&cav.pose.transform(forward_m, left_m));
@@ -430,7 +429,8 @@ impl BirdseyePicture<'_> {
     }
 
     fn legend(&self, beyond: usize) -> Group {
-        let (x, mut y) = (self.sheet.right() + 52.0, self.sheet.top() + 12.0);
+        let x = self.sheet.right() + 52.0;
+        let mut y = self.sheet.top() + 12.0;
         let mut group = Group::new();
         let mut entry = |sign: Group, words: &str| {
             let row = std::mem::replace(&mut group, Group::new());

@@ -232,7 +232,8 @@ impl DetectionFields {
         place: &KeyPath,
     ) -> Result<Detection, TestbedError> {
         let [y_min, x_min, y_max, x_max] = self.bounding_box;
-        let (width, height) = (f64::from(camera.width), f64::from(camera.height));
+        let width = f64::from(camera.width);
+        let height = f64::from(camera.height);
         let bounding_box = BoundingBox {
             x_min: x_min * width,
             y_min: y_min * height,

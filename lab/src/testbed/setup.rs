@@ -58,7 +58,8 @@ pub fn unused_name(scene: &Scene, wanted: &'static str) -> NodeName {
 
 /// A vehicle's configuration, with its frames from `source`.
 pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) -> NodeConfig {
-    let (placard, intrinsics) = (&testbed.placard, &testbed.camera.intrinsics);
+    let placard = &testbed.placard;
+    let intrinsics = &testbed.camera.intrinsics;
     let half_angle = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
     let camera = CameraConfig {
         name: None,
@@ -115,8 +116,10 @@ pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
 /// Fusion of reports: a round for every frame, which counts until some more have come.
 pub fn fusion(testbed: &Testbed) -> FusionConfig {
     let period_s = testbed.camera.capture_interval.as_secs_f64();
-    let (mut window, mut pace) = (WindowConfig::default(), PaceConfig::default());
-    (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
+    let mut window = WindowConfig::default();
+    let mut pace = PaceConfig::default();
+    pace.gate_m = GATE_M;
+    pace.position_floor_m = 0.01;
     pace.max_age_s = pace
         .max_age_s
         .max(FRAMES_REMEMBERED * period_s)

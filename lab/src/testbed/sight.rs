@@ -74,13 +74,13 @@ impl Sighting {
     /// View of `card` among `cards` by the camera at `camera`; `None` unless the code lies fully
     /// inside the image and shows its front.
     pub fn of(card: &Card, cards: &[Card], camera: &Pose, testbed: &Testbed) -> Option<Self> {
-        let (intrinsics, placard) = (&testbed.camera.intrinsics, &testbed.placard);
+        let intrinsics = &testbed.camera.intrinsics;
+        let placard = &testbed.placard;
         let half_m = placard.qr_width_m / 2.0;
-        let (left, right) = (card.slope(camera, -half_m)?, card.slope(camera, half_m)?);
-        let (left_px, right_px) = (
-            intrinsics.cx - intrinsics.fx * left,
-            intrinsics.cx - intrinsics.fx * right,
-        );
+        let left = card.slope(camera, -half_m)?;
+        let right = card.slope(camera, half_m)?;
+        let left_px = intrinsics.cx - intrinsics.fx * left;
+        let right_px = intrinsics.cx - intrinsics.fx * right;
         if right_px <= left_px || left_px < 0.0 || right_px > f64::from(intrinsics.width) {
             return None;
         }

@@ -42,10 +42,8 @@ impl Trial<'_> {
     pub fn run(&self, reports: &BTreeMap<NodeName, Vec<ObjectReport>>) -> SceneResult {
         let mut fused = self.aggregator(Algorithms::Pace);
         let mut by_paper = self.paper_aggregator();
-        let (mut voting, mut agreeing) = (
-            self.aggregator(Algorithms::Vote),
-            self.aggregator(Algorithms::Both),
-        );
+        let mut voting = self.aggregator(Algorithms::Vote);
+        let mut agreeing = self.aggregator(Algorithms::Both);
         let alone = || (self.aggregator(Algorithms::Pace), SpotScore::default());
         let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> = self
             .scene
@@ -208,7 +206,8 @@ fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<F
     let last = reports.last()?.captured_at_us;
     let mut round = None;
     for report in &reports {
-        let (node, captured_at) = (&report.node, report.captured_at_us);
+        let node = &report.node;
+        let captured_at = report.captured_at_us;
         for (kind, report) in [
             (ReportKind::VoteDetections, report.votes()),
             (ReportKind::Detections, report.clone()),

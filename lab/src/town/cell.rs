@@ -106,7 +106,8 @@ impl TownCell {
             neighbour_objects: Vec::new(),
             ..map
         };
-        let (cell, origin) = (self.topic.cell.clone(), self.frame.origin);
+        let cell = self.topic.cell.clone();
+        let origin = self.frame.origin;
         let sent_at_us = self.frame.time(now);
         Some((
             self.topic.clone(),

@@ -19,7 +19,8 @@ pub(super) struct CellFrame {
 impl CellFrame {
     pub(super) fn new(town: &GeographicOrigin, origin: GeographicOrigin, clock_us: i64) -> Self {
         let place = |x_m| origin.to_map(&town.to_wgs84(x_m, 0.0, 0.0)).xy();
-        let (zero, east) = (place(0.0), place(100.0));
+        let zero = place(0.0);
+        let east = place(100.0);
         let angle = (east.y - zero.y).atan2(east.x - zero.x);
         Self {
             origin,
@@ -42,12 +43,14 @@ impl CellFrame {
         report.captured_at_us = self.time(report.captured_at_us);
         if let Some(pose) = &mut report.pose {
             let place = self.into * Point2::new(pose.x_m, pose.y_m);
-            (pose.x_m, pose.y_m) = (place.x, place.y);
+            pose.x_m = place.x;
+            pose.y_m = place.y;
             pose.heading_rad = wrap_angle(pose.heading_rad + self.into.rotation.angle());
         }
         for object in &mut report.objects {
             let place = self.into * Point2::new(object.x_m, object.y_m);
-            (object.x_m, object.y_m) = (place.x, place.y);
+            object.x_m = place.x;
+            object.y_m = place.y;
             object.velocity_mps = object
                 .velocity_mps
                 .map(|velocity| (self.into * Vector2::from(velocity)).into());

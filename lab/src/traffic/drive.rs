@@ -115,7 +115,8 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
     let mut mind = |distance_m: f64, other: &MovingVehicle| {
         let gap_m = distance_m - (me.length_m + other.length_m) / 2.0;
         if gap_m < ahead.gap_m {
-            (ahead.gap_m, ahead.speed_mps) = (gap_m, other.speed_mps);
+            ahead.gap_m = gap_m;
+            ahead.speed_mps = other.speed_mps;
         }
     };
     let after = match next {
@@ -149,7 +150,8 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
                 && is_free(vehicles, number, at, heading, to);
             let to_line_m = remaining_m - me.length_m / 2.0;
             if !may_go && to_line_m < ahead.gap_m {
-                (ahead.gap_m, ahead.speed_mps) = (to_line_m, 0.0);
+                ahead.gap_m = to_line_m;
+                ahead.speed_mps = 0.0;
             }
         }
         (Path::Turn { from, to, .. }, _) if from != to => ahead.limit_mps = BEND_MPS,

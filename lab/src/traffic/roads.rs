@@ -108,7 +108,8 @@ impl Roads {
     pub(super) fn place(&self, path: Path, along_m: f64) -> (Point2<f64>, f64) {
         match path {
             Path::Lane { from, heading } => {
-                let (along, right) = (unit(heading), right_of(heading));
+                let along = unit(heading);
+                let right = right_of(heading);
                 let at = self.center(from) + along * (CROSSING_M + along_m) + right * LANE_M;
                 (at, along.y.atan2(along.x))
             }
@@ -184,26 +185,27 @@ impl Roads {
 }
 
 fn bezier([begin, control, end]: &[Point2<f64>; 3], share: f64) -> (Point2<f64>, Vector2<f64>) {
-    let (first, second) = (
-        begin + (control - begin) * share,
-        control + (end - control) * share,
-    );
+    let first = begin + (control - begin) * share;
+    let second = control + (end - control) * share;
     (first + (second - first) * share, second - first)
 }
 
 impl Building {
     /// True if it stands between two points: the segment crosses it (slab test).
     pub(super) fn hides(&self, from: &Point2<f64>, to: &Point2<f64>) -> bool {
-        let (mut enter, mut leave) = (0.0f64, 1.0f64);
+        let mut enter = 0.0f64;
+        let mut leave = 1.0f64;
         for axis in 0..2 {
-            let (start, step) = (from[axis] - self.center[axis], to[axis] - from[axis]);
+            let start = from[axis] - self.center[axis];
+            let step = to[axis] - from[axis];
             if step.abs() < 1e-9 {
                 if start.abs() > self.half_m {
                     return false;
                 }
                 continue;
             }
-            let (a, b) = ((-self.half_m - start) / step, (self.half_m - start) / step);
+            let a = (-self.half_m - start) / step;
+            let b = (self.half_m - start) / step;
             enter = enter.max(a.min(b));
             leave = leave.min(a.max(b));
         }

@@ -77,13 +77,15 @@ impl Sight {
         let mut covers: Vec<(f64, f64)> = others
             .filter_map(|other| {
                 let middle = wrap_angle(other.bearing_rad - self.bearing_rad);
-                let (low, high) = (middle - other.half_rad, middle + other.half_rad);
+                let low = middle - other.half_rad;
+                let high = middle + other.half_rad;
                 (low < self.half_rad && high > -self.half_rad)
                     .then_some((low.max(-self.half_rad), high.min(self.half_rad)))
             })
             .collect();
         covers.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let (mut covered, mut reached) = (0.0, -self.half_rad);
+        let mut covered = 0.0;
+        let mut reached = -self.half_rad;
         for (low, high) in covers {
             covered += (high - low.max(reached)).max(0.0);
             reached = reached.max(high);

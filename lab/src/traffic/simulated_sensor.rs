@@ -156,7 +156,8 @@ impl SimulatedSensor {
             }
         }
         for _ in 0..dice.poisson(sensor.clutter) {
-            let (position, label) = (somewhere(config, &around.pose, dice), around.label(dice));
+            let position = somewhere(config, &around.pose, dice);
+            let label = around.label(dice);
             found.push(Found {
                 position,
                 label,

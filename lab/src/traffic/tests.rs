@@ -43,11 +43,9 @@ fn errors(recording: &TrafficRecording) -> Vec<f64> {
 
 #[test]
 fn equal_seeds_give_equal_traffic() {
-    let (one, again, other) = (
-        generated(&small(), 7),
-        generated(&small(), 7),
-        generated(&small(), 8),
-    );
+    let one = generated(&small(), 7);
+    let again = generated(&small(), 7);
+    let other = generated(&small(), 8);
     assert_eq!(one, again);
     assert_ne!(one, other);
 }
@@ -93,7 +91,8 @@ fn vehicles_move_stop_and_keep_apart() {
     };
     let recording = generated(&config, 3);
     let mut tracks: BTreeMap<usize, Vec<Point2<f64>>> = BTreeMap::new();
-    let (mut pairs, mut too_close) = (0, 0);
+    let mut pairs = 0;
+    let mut too_close = 0;
     for frame in &recording.truth.frames {
         let cars: Vec<_> = frame
             .objects
@@ -151,7 +150,8 @@ fn detections_are_near_the_truth_and_false_alarms_are_not() {
         let errors = errors(&generated(config, 5));
         errors.iter().filter(|error| **error < limit).count() as f64 / errors.len() as f64
     };
-    let (near, far) = (within(&small(), 2.0), within(&small(), 4.0));
+    let near = within(&small(), 2.0);
+    let far = within(&small(), 4.0);
     assert!(
         near > 0.7 && far < 0.98,
         "{near} within 2 m, {far} within 4 m"
@@ -179,7 +179,8 @@ fn more_observers_see_more() {
         .truth;
         truth.frames.last().map_or(0, |frame| frame.objects.len())
     };
-    let (few, many) = (seen(2), seen(20));
+    let few = seen(2);
+    let many = seen(20);
     assert!(many > few + 20, "{few} and {many}");
 }
 

@@ -79,7 +79,8 @@ impl Walker {
             self.along_m
         };
         let side = (along_m / self.side_m) as usize % 4;
-        let (along, out) = (unit(side), unit(side + 3));
+        let along = unit(side);
+        let out = unit(side + 3);
         let at = self.block
             + out * (self.side_m / 2.0)
             + along * (along_m - (side as f64 + 0.5) * self.side_m);

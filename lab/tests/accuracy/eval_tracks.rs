@@ -26,7 +26,8 @@ fn compare(path: &str, found: &Value, expected: &Value) -> usize {
             .map(|(place, value)| compare(&format!("{path}[{place}]"), &found[place], value))
             .sum(),
         expected => {
-            let (found, expected) = (found.as_f64(), expected.as_f64().unwrap());
+            let found = found.as_f64();
+            let expected = expected.as_f64().unwrap();
             assert!(
                 found.is_some_and(|found| (found - expected).abs() < 1e-6),
                 "{path}: {found:?} is not {expected}"

@@ -30,7 +30,8 @@ const DETECTOR_SIGMA_PX: f64 = 1.5;
 const PAPER_FROM: f64 = 178.0;
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     Mount {
         height_m: Some(height_m),
         pitch_rad,
@@ -89,10 +90,13 @@ fn boxes(testbed: &Testbed, places: &[Point2<f64>], mount: &Mount) -> Vec<Boundi
         ..scene.cavs[0].clone()
     };
     let rendered = TestbedCamera::mounted(testbed, &scene, &cav, mount, 1).unwrap();
-    let (mut gray, mut paper) = (Mat::default(), Mat::default());
+    let mut gray = Mat::default();
+    let mut paper = Mat::default();
     imgproc::cvt_color_def(rendered.still(), &mut gray, imgproc::COLOR_BGR2GRAY).unwrap();
     imgproc::threshold(&gray, &mut paper, PAPER_FROM, 255.0, imgproc::THRESH_BINARY).unwrap();
-    let (mut labels, mut stats, mut middles) = (Mat::default(), Mat::default(), Mat::default());
+    let mut labels = Mat::default();
+    let mut stats = Mat::default();
+    let mut middles = Mat::default();
     let count =
         imgproc::connected_components_with_stats_def(&paper, &mut labels, &mut stats, &mut middles)
             .unwrap();
@@ -115,7 +119,8 @@ struct Dice(ChaCha8Rng);
 
 impl Dice {
     fn normal(&mut self) -> f64 {
-        let (u, v): (f64, f64) = (self.0.random(), self.0.random());
+        let u: f64 = self.0.random();
+        let v: f64 = self.0.random();
         (-2.0 * (1.0 - u).ln()).sqrt() * (2.0 * PI * v).cos()
     }
 
@@ -315,7 +320,8 @@ fn shares(
         heading_sigma_rad,
         ..
     } = ProjectionConfig::default();
-    let (mut covered, mut all) = ([0, 0], [0, 0]);
+    let mut covered = [0, 0];
+    let mut all = [0, 0];
     for _ in 0..MOUNTS {
         for (found, places) in frames {
             let mut off = |sigma: f64| sigma * dice.normal();

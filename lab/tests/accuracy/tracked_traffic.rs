@@ -86,11 +86,10 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
     for (config, floor) in [(town, FLOOR_TOWN), (two, FLOOR_TWO)] {
         let recording = recording_of(&config);
         let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap();
-        let (mut ours, mut late) = (
-            TrackEvaluation::new(truth.clone()),
-            TrackEvaluation::new(truth),
-        );
-        let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
+        let mut ours = TrackEvaluation::new(truth.clone());
+        let mut late = TrackEvaluation::new(truth);
+        let mut latest = LatestReports::default();
+        let mut tracker = NearestTracker::default();
         fuse(&recording, |report, map| {
             report.into_iter().for_each(|report| latest.report(report));
             if let Some(map) = map {
@@ -249,7 +248,8 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
         .reduce(|a, b| [0, 1, 2, 3, 4, 5].map(|figure| a[figure].max(b[figure])))
         .unwrap();
     let mut late = TrackEvaluation::new(truth.clone());
-    let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
+    let mut latest = LatestReports::default();
+    let mut tracker = NearestTracker::default();
     let ours = [true, false].map(|align| {
         let mut config = FusionConfig::default();
         config.tracks.align = align;

@@ -55,10 +55,8 @@ fn result_of(change: impl Fn(&mut serde_json::Value)) -> serde_json::Value {
     let mut file: serde_json::Value =
         serde_json::from_slice(&std::fs::read(scenes()).unwrap()).unwrap();
     change(&mut file);
-    let (scenes, out) = (
-        directory.path().join("scenes.json"),
-        directory.path().join("result.json"),
-    );
+    let scenes = directory.path().join("scenes.json");
+    let out = directory.path().join("result.json");
     std::fs::write(&scenes, file.to_string()).unwrap();
     let mut testbed = ecod_lab();
     testbed
@@ -173,7 +171,8 @@ fn in_the_street_the_cell_knows_more_than_any_camera_and_survives_its_edge() {
             .map(|share| share["known"].as_f64().unwrap());
         nodes.collect::<Vec<_>>()
     };
-    let (alone, with_cell) = (known("alone"), known("with_cell"));
+    let alone = known("alone");
+    let with_cell = known("with_cell");
     assert_eq!((alone.len(), with_cell.len()), (4, 4), "{told}");
     let best_alone = alone.into_iter().fold(0.0, f64::max);
     assert!(

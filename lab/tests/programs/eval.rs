@@ -86,11 +86,9 @@ fn replay_lot(folder: &TempDir) -> PathBuf {
 fn a_replay_is_judged_beside_majority_and_every_vehicle() {
     let folder = TempDir::new().unwrap();
     let output = replay_lot(&folder);
-    let (truth, reports, config) = (
-        example("recordings/lot_truth.json"),
-        example("recordings/lot.jsonl"),
-        example("recordings/lot.toml"),
-    );
+    let truth = example("recordings/lot_truth.json");
+    let reports = example("recordings/lot.jsonl");
+    let config = example("recordings/lot.toml");
     let result = folder.path().join("result.json");
     let run = eval(
         &["--reports", text(&reports), "--config", text(&config)],
@@ -134,11 +132,9 @@ fn objects_that_move_are_judged_by_where_they_were() {
         ))
         .join(name)
     };
-    let (truth, maps, result) = (
-        recorded("truth.json"),
-        recorded("maps.jsonl"),
-        folder.path().join("result.json"),
-    );
+    let truth = recorded("truth.json");
+    let maps = recorded("maps.jsonl");
+    let result = folder.path().join("result.json");
     let run = eval(&[], &truth, &maps, &result);
     succeeded(&run);
     let table = String::from_utf8(run.stdout).unwrap();
@@ -211,7 +207,8 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
         let run = eval(&["--format", "kitti"], truth, input, &result);
         succeeded(&run);
         let result = json(&result);
-        let (tracks, at) = (&result["tracks"], &result["tracks"]["at_default"]);
+        let tracks = &result["tracks"];
+        let at = &tracks["at_default"];
         assert_eq!(
             (tracks["frames"].as_u64(), tracks["objects"].as_u64()),
             (Some(4), Some(8))
@@ -381,11 +378,9 @@ fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these()
 #[test]
 fn a_truth_without_identities_judges_none() {
     let folder = TempDir::new().unwrap();
-    let (truth, maps, result) = (
-        folder.path().join("truth.txt"),
-        folder.path().join("maps.txt"),
-        folder.path().join("result.json"),
-    );
+    let truth = folder.path().join("truth.txt");
+    let maps = folder.path().join("maps.txt");
+    let result = folder.path().join("result.json");
     fs::write(&truth, "1,-1,0,0,9,9,1,3,4,0\n2,-1,0,0,9,9,1,3,4,0\n").unwrap();
     fs::write(&maps, "1,4,0,0,9,9,1,3,4,0\n2,4,0,0,9,9,1,3,5,0\n").unwrap();
     let run = eval(&["--format", "mot"], &truth, &maps, &result);
@@ -407,11 +402,9 @@ fn a_truth_without_identities_judges_none() {
 #[test]
 fn the_recorded_intersection_is_judged_right() {
     let folder = TempDir::new().unwrap();
-    let (scenes, out, reports) = (
-        example("testbed/vote_recording.json"),
-        folder.path().join("result.json"),
-        folder.path().join("reports.jsonl"),
-    );
+    let scenes = example("testbed/vote_recording.json");
+    let out = folder.path().join("result.json");
+    let reports = folder.path().join("reports.jsonl");
     let run = ecod_lab(&[
         "testbed",
         "--scenes",
@@ -451,10 +444,8 @@ fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_interse
         .replace("mouse", "remote")
         .replace("\"cup\"", "\"bottle\"");
     for scene in [renamed, silent.to_string()] {
-        let (scenes, out) = (
-            folder.path().join("scenes.json"),
-            folder.path().join("result.json"),
-        );
+        let scenes = folder.path().join("scenes.json");
+        let out = folder.path().join("result.json");
         fs::write(&scenes, scene).unwrap();
         let run = ecod_lab(&[
             "testbed",
@@ -483,11 +474,9 @@ fn what_cannot_be_judged_is_said() {
         fs::write(&path, content).unwrap();
         path
     };
-    let (recording, truth, empty) = (
-        file("in.jsonl", "{}\n"),
-        file("truth.json", "{\"a\": {}}"),
-        file("empty.jsonl", ""),
-    );
+    let recording = file("in.jsonl", "{}\n");
+    let truth = file("truth.json", "{\"a\": {}}");
+    let empty = file("empty.jsonl", "");
     let frames = file(
         "frames.json",
         r#"{"frames": [{"t_us": 9000000, "objects": []}]}"#,
@@ -531,7 +520,8 @@ fn what_cannot_be_judged_is_said() {
 #[test]
 fn methods_are_compared_in_one_table() {
     let folder = TempDir::new().unwrap();
-    let (own, table) = (folder.path().join("own.jsonl"), folder.path().join("table"));
+    let own = folder.path().join("own.jsonl");
+    let table = folder.path().join("table");
     let fusion = Command::new("python3")
         .arg(example("own_fusion.py"))
         .stdin(fs::File::open(example("recordings/lot.jsonl")).unwrap())

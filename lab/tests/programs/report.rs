@@ -230,7 +230,8 @@ fn a_report_of_the_open_world_is_about_objects() {
     let mut frames = Vec::new();
     for round in 0..20 {
         let at_us = BEGIN_US + round * 100_000;
-        let (right, wrong) = (round as f64, 40.0);
+        let right = round as f64;
+        let wrong = 40.0;
         let object = |id: u128, label: &str, x_m: f64, contributors: &[&str]| {
             json!({ "id": uuid::Uuid::from_u128(id), "label": label, "confidence": 0.9, "x_m": x_m, "y_m": 0.0,
                 "covariance_m2": [0.1, 0.0, 0.1], "contributors": contributors })

@@ -90,7 +90,9 @@ impl SimulatedCell {
     async fn run(self) {
         // Cells do not start, send and return all at once.
         let share = (self.number as f64 * 0.618_034).fract();
-        let (mut server, mut round, mut wait) = (self.number, 0, RETRY_MIN);
+        let mut server = self.number;
+        let mut round = 0;
+        let mut wait = RETRY_MIN;
         sleep(self.period.mul_f64(share)).await;
         loop {
             let address = self.servers[server % self.servers.len()];
@@ -174,7 +176,8 @@ impl SimulatedCell {
         let object = |number: usize| {
             let id = Uuid::from_u128((self.number * 1000 + number) as u128);
             let angle = 0.2 * number as f64;
-            let (x_m, y_m) = (80.0 * angle.cos(), 80.0 * angle.sin());
+            let x_m = 80.0 * angle.cos();
+            let y_m = 80.0 * angle.sin();
             let contributors = vec![
                 NodeName::from_static("euclid"),
                 NodeName::from_static("gauss"),

@@ -31,7 +31,8 @@ pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
     let count = simulated + real;
     let side = (count as f64).sqrt().ceil() as usize;
     let place = |number: usize| {
-        let (row, column) = (number / side, number % side);
+        let row = number / side;
+        let column = number % side;
         let origin = GeographicOrigin {
             latitude_deg: 48.7 + row as f64 * STEP_DEG,
             longitude_deg: 2.2 + column as f64 * 1.5 * STEP_DEG,

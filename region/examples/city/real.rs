@@ -133,14 +133,15 @@ async fn forward(line: SocketAddr, servers: Arc<Vec<SocketAddr>>, opened: watch:
         return;
     };
     while let Ok((near, _)) = listener.accept().await {
-        let (servers, opened) = (Arc::clone(&servers), opened.clone());
+        let servers = Arc::clone(&servers);
+        let opened = opened.clone();
         tokio::spawn(async move {
             let first = NEXT.fetch_add(1, Ordering::Relaxed);
             for number in 0..servers.len() {
                 if let Ok(far) = TcpStream::connect(servers[(first + number) % servers.len()]).await
                 {
-                    let ((near_in, near_out), (far_in, far_out)) =
-                        (near.into_split(), far.into_split());
+                    let (near_in, near_out) = near.into_split();
+                    let (far_in, far_out) = far.into_split();
                     tokio::select! {
                         () = copy(near_in, far_out, opened.clone()) => {}
                         () = copy(far_in, near_out, opened) => {}

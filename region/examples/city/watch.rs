@@ -51,7 +51,8 @@ impl Watch {
     pub(crate) fn start_overview(login: BrokerLogin) -> Self {
         let state = Arc::new(RegionState::default());
         let figures = Arc::new(Mutex::new(Figures::default()));
-        let (read, noted) = (Arc::clone(&state), Arc::clone(&figures));
+        let read = Arc::clone(&state);
+        let noted = Arc::clone(&figures);
         let reading = async move {
             reader::read(&login, &read, |reading| {
                 let mut figures = lock(&noted);
@@ -84,10 +85,8 @@ impl Watch {
     /// Begins a new measurement.
     pub(crate) fn reset(&self) {
         let mut figures = lock(&self.figures);
-        let (newest, too_old) = (
-            std::mem::take(&mut figures.newest),
-            std::mem::take(&mut figures.too_old),
-        );
+        let newest = std::mem::take(&mut figures.newest);
+        let too_old = std::mem::take(&mut figures.too_old);
         *figures = Figures {
             newest,
             too_old,

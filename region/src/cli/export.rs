@@ -68,7 +68,8 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
         ExportFormat::Mcap => Some(CellMapLog::create(&unfinished)?),
         ExportFormat::GeoJson => None,
     };
-    let (log, failed) = (RefCell::new(log), RefCell::new(None));
+    let log = RefCell::new(log);
+    let failed = RefCell::new(None);
     let write = |reading: &Reading<'_>| {
         if let (Some(log), Ok(Accepted::Map(..))) = (log.borrow_mut().as_mut(), &reading.outcome)
             && let Err(error) = log.write(reading.topic, reading.payload, reading.at)

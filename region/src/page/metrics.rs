@@ -42,7 +42,8 @@ pub(super) fn metrics(
     started_at: Timestamp,
 ) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod_region");
-    let (link, tiles) = (state.link(), state.tiles());
+    let link = state.link();
+    let tiles = state.tiles();
     let (cells, counts) = {
         let town = state.town();
         (town.states(&tiles, clock::now()), town.counts().clone())

@@ -171,7 +171,8 @@ async fn show_view(
         &bounds,
         now,
     );
-    let (link, read) = (api.state.link(), api.state.tiles());
+    let link = api.state.link();
+    let read = api.state.tiles();
     let town = api.state.town().view(&bounds, &read, now);
     let maps_withheld = looked.err().map(MapsWithheld::in_words);
     Json(ViewAnswer {

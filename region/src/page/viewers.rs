@@ -155,10 +155,8 @@ impl Viewers {
             );
         }
         in_turn.sort_by_key(|(turn, cells, id, _)| (*turn, *cells, *id));
-        let (mut read, mut withheld) = (
-            self.watched.iter().copied().collect::<BTreeSet<_>>(),
-            BTreeMap::new(),
-        );
+        let mut read = self.watched.iter().copied().collect::<BTreeSet<_>>();
+        let mut withheld = BTreeMap::new();
         let mut cells = 0;
         for (_, cells_of_view, id, view) in in_turn {
             let more: Vec<_> = view

@@ -173,11 +173,13 @@ impl RegionTown {
         read: &ReadTiles,
         now: Timestamp,
     ) -> TownView {
-        let (mut region, mut known) = (TownTotals::default(), None::<GeographicBounds>);
+        let mut region = TownTotals::default();
+        let mut known = None::<GeographicBounds>;
         let mut shown = Vec::new();
         let mut has_maps = true;
         for ((tile, name), cell) in self.cells() {
-            let (read_since, at) = (read.since(*tile), GeographicBounds::of(*tile));
+            let read_since = read.since(*tile);
+            let at = GeographicBounds::of(*tile);
             let state = cell.state(now, read_since);
             region.add(cell, state);
             known = Some(known.map_or(at, |known| known.with(at)));
@@ -323,7 +325,8 @@ impl TownCellView {
         state: CellState,
         now: Timestamp,
     ) -> Self {
-        let (map, status) = (cell.map.as_ref(), cell.status.as_ref());
+        let map = cell.map.as_ref();
+        let status = cell.status.as_ref();
         let [[north, west], [south, east]] = tile.corners_deg();
         let middle = [(north + south) / 2.0, (west + east) / 2.0];
         let [latitude_deg, longitude_deg] = map.map_or(middle, |map| {

@@ -54,10 +54,8 @@ fn map(
             ..of
         }
     };
-    let (epoch, objects) = (
-        Epoch::new(1, NodeName::from_static("edge")),
-        east_m.iter().map(object).collect(),
-    );
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    let objects = east_m.iter().map(object).collect();
     let map = GlobalMap {
         objects,
         ..GlobalMap::new(&epoch, round, at(ms))

@@ -32,7 +32,8 @@ const DEPLOY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/region");
 impl Broker {
     /// NATS by `nats.conf`, with TLS and accounts of [`LOT`] and [`FAR`].
     pub(crate) fn nats() -> Self {
-        let (directory, address) = (TempDir::new().unwrap(), free_address());
+        let directory = TempDir::new().unwrap();
+        let address = free_address();
         for file in ["common.conf", "nats.conf", "mqtt.conf"] {
             fs::copy(Path::new(DEPLOY).join(file), directory.path().join(file)).unwrap();
         }
@@ -104,7 +105,8 @@ impl Broker {
 
     /// mosquitto with the same accounts and certificates, and the user `town`, who may publish for all cells.
     pub(crate) fn mosquitto() -> Self {
-        let (directory, address) = (TempDir::new().unwrap(), free_address());
+        let directory = TempDir::new().unwrap();
+        let address = free_address();
         let at = |file: &str| directory.path().join(file).display().to_string();
         make_certificates(&directory.path().join("tls"));
         let mut acl =
@@ -117,7 +119,8 @@ impl Broker {
         fs::create_dir(at("passwords")).unwrap();
         for user in ["region.reader", "town", LOT.0, FAR.0] {
             fs::write(at(&format!("passwords/{user}")), "secret\n").unwrap();
-            let (file, made) = (at("passwd"), directory.path().join("passwd").exists());
+            let file = at("passwd");
+            let made = directory.path().join("passwd").exists();
             let create: &[&str] = if made { &[] } else { &["-c"] };
             let status = Command::new("mosquitto_passwd")
                 .args(create)
@@ -227,10 +230,8 @@ impl Broker {
 
     /// A reader of the whole region that tells of each message.
     pub(crate) fn read(&self, seen: impl FnMut(&Reading<'_>) + Send + 'static) -> Arc<RegionState> {
-        let (login, state) = (
-            self.login("region.reader"),
-            Arc::new(RegionState::default()),
-        );
+        let login = self.login("region.reader");
+        let state = Arc::new(RegionState::default());
         state.ask(["".parse().unwrap()].into());
         let read = Arc::clone(&state);
         tokio::spawn(async move { reader::read(&login, &read, seen).await });

@@ -40,7 +40,8 @@ struct Reader {
 
 impl Reader {
     fn start(broker: &Broker) -> Self {
-        let (arguments, address) = (broker.arguments("region.reader"), free_address());
+        let arguments = broker.arguments("region.reader");
+        let address = free_address();
         let child = Command::new(env!("CARGO_BIN_EXE_ecod-region"))
             .args([
                 "serve",
@@ -97,7 +98,8 @@ impl Drop for Reader {
 /// The cell at a place of the grid, of which x counts eastward and y northward.
 fn cell(x: usize, y: usize) -> (NodeName, GeographicOrigin) {
     // Tiles are 0.011 degrees wide, and 0.0072 high at this latitude.
-    let (latitude_deg, longitude_deg) = (48.5 + 0.0075 * y as f64, 2.0 + 0.011 * x as f64);
+    let latitude_deg = 48.5 + 0.0075 * y as f64;
+    let longitude_deg = 2.0 + 0.011 * x as f64;
     let name = NodeName::new(format!("cell-{x}-{y}")).unwrap();
     (
         name,

@@ -60,7 +60,8 @@ fn publish(lot: &Cell, far: &Cell, round: u64) {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_counts_what_is_in_view_and_reads_no_more() {
     let broker = Broker::nats();
-    let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
+    let lot = Cell::connect(&broker, LOT);
+    let far = Cell::connect(&broker, FAR);
     let state = Arc::new(RegionState::default());
     let page = RegionPage::listen(
         "127.0.0.1:0".parse().unwrap(),
@@ -73,7 +74,8 @@ async fn the_page_counts_what_is_in_view_and_reads_no_more() {
     let address = page.address();
     assert!(matches!(page.address().port(), 1..));
     tokio::spawn(page.serve());
-    let (login, read) = (broker.login("region.reader"), Arc::clone(&state));
+    let login = broker.login("region.reader");
+    let read = Arc::clone(&state);
     tokio::spawn(async move { reader::read(&login, &read, |_| ()).await });
     let look =
         move |bounds: &'static str| tokio::task::spawn_blocking(move || view(address, bounds));

@@ -20,7 +20,8 @@ async fn listen(broker: &Broker) -> Arc<Mutex<Vec<String>>> {
 
 /// Tries all that a cell must not, and then what it may; returns what came through.
 async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<String> {
-    let (lot, far) = (Cell::connect(broker, LOT), Cell::connect(broker, FAR));
+    let lot = Cell::connect(broker, LOT);
+    let far = Cell::connect(broker, FAR);
     // The last of its own messages shows that all before it had their chance.
     let foreign_name = |kind| {
         RegionTopic {
@@ -80,10 +81,8 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         !later.lock().unwrap().is_empty()
     })
     .await;
-    let (arrived, later) = (
-        arrived.lock().unwrap().clone(),
-        later.lock().unwrap().clone(),
-    );
+    let arrived = arrived.lock().unwrap().clone();
+    let later = later.lock().unwrap().clone();
     arrived.into_iter().chain(later).collect()
 }
 
@@ -102,7 +101,8 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
     let broker = Broker::nats();
     let arrived = listen(&broker).await;
     let heard = attack(&broker, &arrived).await;
-    let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
+    let lot = Cell::connect(&broker, LOT);
+    let far = Cell::connect(&broker, FAR);
     assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
 
     let tiles = lot.account.tile.with_neighbours();
@@ -132,7 +132,8 @@ async fn on_mosquitto_a_cell_writes_below_its_own_tile_and_hears_the_tiles_aroun
     let broker = Broker::mosquitto();
     let arrived = listen(&broker).await;
     let heard = attack(&broker, &arrived).await;
-    let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
+    let lot = Cell::connect(&broker, LOT);
+    let far = Cell::connect(&broker, FAR);
     let own = lot.topic(RegionTopicKind::Map);
     assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
     // Subscriptions are granted, and nothing foreign comes.

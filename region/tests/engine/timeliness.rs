@@ -47,7 +47,8 @@ async fn a_burst_of_old_maps_after_a_pause_reaches_nobody() {
         }
     };
     publish_for(Duration::from_secs(3)).await;
-    let (before, stale_before) = (taken.lock().unwrap().len(), stale());
+    let before = taken.lock().unwrap().len();
+    let stale_before = stale();
     assert!(before > 10, "{before}");
 
     broker.signal("STOP");

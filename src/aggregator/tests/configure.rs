@@ -77,10 +77,8 @@ fn a_change_keeps_votes_tracks_and_trust_of_places_that_are_still_there() {
     for mode in [PaceMode::Bayes, PaceMode::Paper] {
         let (mut cell, before) = running(&settings(mode));
         assert_eq!(labels(&before), [("a", Some("cup")), ("b", Some("vase"))]);
-        let (reputations, car) = (
-            cell.reputations(),
-            before.map.as_ref().unwrap().objects[0].id,
-        );
+        let reputations = cell.reputations();
+        let car = before.map.as_ref().unwrap().objects[0].id;
         let mut fusion = settings(mode);
         fusion.round.period_s = 0.05;
         fusion.tracks.gate_m = 3.0;

@@ -106,7 +106,8 @@ impl Cell {
             description: None,
         };
         self.now = self.now + transit;
-        let (leadership, now) = (self.leadership(to), self.now);
+        let leadership = self.leadership(to);
+        let now = self.now;
         let receiver = &mut self.nodes[to];
         receiver
             .time
@@ -118,7 +119,8 @@ impl Cell {
 
     fn look(&mut self) {
         for index in 0..self.nodes.len() {
-            let (leadership, now) = (self.leadership(index), self.now);
+            let leadership = self.leadership(index);
+            let now = self.now;
             let node = &mut self.nodes[index];
             let events = node.time.look(
                 node.wall_us - node.steady_us,
@@ -253,7 +255,8 @@ fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
     ]);
     cell.run(5);
     cell.all_know(ahead, 5_000);
-    (cell.leader, cell.nodes[0].wall_us) = (1, 0);
+    cell.leader = 1;
+    cell.nodes[0].wall_us = 0;
     cell.run(2);
     cell.all_know(ahead, 30_000);
     cell.run(120);
@@ -350,11 +353,9 @@ fn of_clocks_that_differ_the_ones_that_agree_are_right() {
         };
         wrong.map(shown).collect::<Vec<_>>()
     };
-    let (edge, cav, other) = (
-        (Role::Edge, 0, 30 * SECOND_US),
-        (Role::Cav, 9, 0),
-        (Role::Cav, 7 * SECOND_US, 0),
-    );
+    let edge = (Role::Edge, 0, 30 * SECOND_US);
+    let cav = (Role::Cav, 9, 0);
+    let other = (Role::Cav, 7 * SECOND_US, 0);
     assert_eq!(wrong(&[edge, cav, other]), [(None, 30.0, true, true)]);
     assert_eq!(
         wrong(&[edge, cav]),
@@ -417,7 +418,8 @@ fn a_leader_that_is_not_trusted_any_more_has_no_say_in_its_successors_time() {
     let mut cell = Cell::new(&[(Role::Edge, 0, forged), (Role::Auto, 0, 0)]);
     cell.run(3);
     assert!(cell.errors()[1].abs_diff(forged) < 5_000);
-    let (gone, now) = (cell.nodes[0].name.clone(), cell.now);
+    let gone = cell.nodes[0].name.clone();
+    let now = cell.now;
     cell.leader = 1;
     let leadership = cell.leadership(1);
     let successor = &mut cell.nodes[1];

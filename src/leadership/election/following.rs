@@ -72,8 +72,8 @@ impl Election {
             State::Leading(_) => self.meet_leader(beat, now),
             State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
             State::Following(following) if beat.epoch > following.epoch => {
-                let (leader, claimant) =
-                    (following.epoch.leader.clone(), beat.epoch.leader.clone());
+                let leader = following.epoch.leader.clone();
+                let claimant = beat.epoch.leader.clone();
                 let content = now < following.suspect_at(&self.config);
                 let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
                 let gives_way = if self.outranks(&claimant, &leader) {
@@ -113,7 +113,8 @@ impl Election {
         let State::Leading(leading) = &self.state else {
             return;
         };
-        let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());
+        let own = leading.epoch.clone();
+        let other = beat.epoch.leader.clone();
         if beat.epoch < own {
             self.send_beat(&other, now);
             return;

@@ -47,7 +47,8 @@ impl LeaderClock {
     /// Processes a beat that the leader has just sent.
     pub(super) fn beat(&mut self, life: LifeSign, now: Timestamp) {
         self.began_at = now - Duration::from_millis(life.led_ms);
-        (self.observed_at, self.latest_received_at) = (now, now);
+        self.observed_at = now;
+        self.latest_received_at = now;
         self.latest = life;
     }
 

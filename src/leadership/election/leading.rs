@@ -160,10 +160,8 @@ impl Election {
     /// Schedules a term above the rival's, and asks all nodes which leader they follow: this node
     /// may have been stalled, and its followers may have left it.
     pub(super) fn contest(&mut self, rival: &NodeName, now: Timestamp) {
-        let (soon, is_followed) = (
-            now + self.config.given_up_timeout(),
-            self.peers.followers(rival, now) > 0,
-        );
+        let soon = now + self.config.given_up_timeout();
+        let is_followed = self.peers.followers(rival, now) > 0;
         let State::Leading(leading) = &mut self.state else {
             return;
         };

@@ -152,8 +152,8 @@ impl Election {
         match &self.state {
             State::Leading(_) => return self.send_beat(from, now),
             State::Following(following) if now.since(following.evidence_at()) <= patience => {
-                let (leader, evidence_at) =
-                    (following.epoch.leader.clone(), following.evidence_at());
+                let leader = following.epoch.leader.clone();
+                let evidence_at = following.evidence_at();
                 let recent =
                     life.filter(|clock| now.since(clock.latest_at()) <= self.config.beat() * 2);
                 if let Some(life) = recent.map(|clock| clock.latest().clone()) {
@@ -231,7 +231,8 @@ impl Election {
     pub(super) fn lead(&mut self, after: Option<Epoch>, now: Timestamp) {
         let term = self.terms.seen.max(self.terms.found) + 1;
         self.persist(term);
-        (self.terms.seen, self.terms.found) = (term, term);
+        self.terms.seen = term;
+        self.terms.found = term;
         let epoch = Epoch::new(term, self.id.clone());
         self.epoch = Some(epoch.clone());
         let successors = self.successors(now);

@@ -277,7 +277,8 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
             break;
         }
     }
-    let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
+    let own = election.epoch().cloned();
+    let next = Epoch::new(2, gauss.clone());
     let ElectionInput::Receive { message } =
         received(&gauss, 1, Some(&next), beat_after(own.as_ref()))
     else {
@@ -305,7 +306,8 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
 #[test]
 fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
-    let (before, next) = (Epoch::new(1, edge.clone()), Epoch::new(2, gauss.clone()));
+    let before = Epoch::new(1, edge.clone());
+    let next = Epoch::new(2, gauss.clone());
     let now = Timestamp(1_000_000);
     let mut election = Election::new(
         ElectionConfig::default(),
@@ -394,7 +396,8 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
 #[test]
 fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
-    let (mut election, mut now) = (euclid(), NOW);
+    let mut election = euclid();
+    let mut now = NOW;
     while !election.is_leading() {
         now = election.next_deadline();
         election.tick(now);
@@ -473,9 +476,11 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
         now,
     );
     assert_eq!(told.leader(), Some(&edge));
-    let (began, mut seq) = (now, 1);
+    let began = now;
+    let mut seq = 1;
     while election.is_leading() {
-        (now, seq) = (now + Duration::from_millis(50), seq + 1);
+        now = now + Duration::from_millis(50);
+        seq += 1;
         assert!(now.since(began) < Duration::from_secs(2), "nobody follows");
         election.tick(now);
         tell(&mut election, seq, now);
@@ -490,7 +495,9 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
 /// Times at which euclid began another term after gauss had refused its first one.
 fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
     let gauss = NodeName::from_static("gauss");
-    let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
+    let mut election = euclid();
+    let mut now = NOW;
+    let mut seq = 0;
     let mut status = |election: &mut Election, epoch: Option<&Epoch>, over: Option<Epoch>, now| {
         seq += 1;
         election.handle(
@@ -622,7 +629,8 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
 
 #[test]
 fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
-    let (gauss, mut election) = (NodeName::from_static("gauss"), euclid());
+    let gauss = NodeName::from_static("gauss");
+    let mut election = euclid();
     election.handle(of_edge(1, 8, beat(1)), NOW);
     for (seq, term) in [(1, MAX_TERM), (2, 8 + MAX_TERM_STEP / 2)] {
         let epoch = Epoch::new(8 + MAX_TERM_STEP / 2, gauss.clone());
@@ -733,7 +741,8 @@ fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
 
 #[test]
 fn a_claim_waits_no_longer_for_being_repeated() {
-    let (mut election, mut now) = (euclid(), NOW);
+    let mut election = euclid();
+    let mut now = NOW;
     let idle = Body::Beat {
         every_ms: 2500,
         round: 1,
@@ -756,11 +765,10 @@ fn a_claim_waits_no_longer_for_being_repeated() {
 /// One certificate is valid for several names: the node's name and the names of its parts.
 #[test]
 fn the_parts_of_a_node_depose_no_leader() {
-    let (mut election, mut now) = (euclid(), NOW);
-    let (gauss, hopper) = (
-        NodeName::from_static("gauss"),
-        NodeName::from_static("hopper"),
-    );
+    let mut election = euclid();
+    let mut now = NOW;
+    let gauss = NodeName::from_static("gauss");
+    let hopper = NodeName::from_static("hopper");
     let mut seq = 0;
     let mut status = |election: &mut Election, from: &NodeName, epoch: Option<&Epoch>, now| {
         seq += 1;
@@ -819,10 +827,8 @@ fn a_first_boot_beside_a_liar_is_no_separate_cell() {
 
 #[test]
 fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
-    let (gauss, edge) = (
-        NodeName::from_static("gauss"),
-        NodeName::from_static("edge"),
-    );
+    let gauss = NodeName::from_static("gauss");
+    let edge = NodeName::from_static("edge");
     let old = Epoch::new(1_800_000_000, edge.clone());
     let mut election = euclid_after(0);
     let mut now = NOW;
@@ -850,10 +856,8 @@ fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
 /// of its own it would wait for the claims of nodes on the other side.
 #[test]
 fn questions_of_other_nodes_do_not_delay_the_own_question() {
-    let (edge, gauss) = (
-        NodeName::from_static("edge"),
-        NodeName::from_static("gauss"),
-    );
+    let edge = NodeName::from_static("edge");
+    let gauss = NodeName::from_static("gauss");
     let epoch = epoch_of_edge();
     let at = |ms: u64| NOW + Duration::from_millis(ms);
     let mut euclid = euclid();

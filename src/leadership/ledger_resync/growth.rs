@@ -24,7 +24,8 @@ const MARK_VOTES: u64 = 32;
 
 /// True for saved evidence within the bounds of evidence that is received for the first time.
 pub fn is_plausible(share: &LedgerShare) -> bool {
-    let (unknown, never) = (GrowthLimit::default(), Timestamp::default());
+    let unknown = GrowthLimit::default();
+    let never = Timestamp::default();
     let mut terms = share
         .entries
         .iter()

@@ -157,7 +157,9 @@ fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> LedgerSha
 }
 
 fn slander(epoch: u64, aggregator: &str, incorrect: u64) -> LedgerEntry {
-    let (aggregator, node, label) = (name(aggregator), name("gauss"), "cup".into());
+    let aggregator = name(aggregator);
+    let node = name("gauss");
+    let label = "cup".into();
     LedgerEntry {
         epoch,
         aggregator,
@@ -340,11 +342,9 @@ fn a_candidate_that_says_it_leads_does_not_have_others_send_all_evidence() {
 
 #[test]
 fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains() {
-    let (mut a, mut b1, mut b2) = (
-        Candidate::new("a"),
-        Candidate::new("b1"),
-        Candidate::new("b2"),
-    );
+    let mut a = Candidate::new("a");
+    let mut b1 = Candidate::new("b1");
+    let mut b2 = Candidate::new("b2");
     a.lead(1);
     b1.lead(2);
     b1.record(2, "euclid");
@@ -364,11 +364,9 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
 
 #[test]
 fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
-    let (mut a, mut b1, mut b2) = (
-        Candidate::new("a"),
-        Candidate::new("b1"),
-        Candidate::new("b2"),
-    );
+    let mut a = Candidate::new("a");
+    let mut b1 = Candidate::new("b1");
+    let mut b2 = Candidate::new("b2");
     b1.lead(2);
     b1.record(2, "euclid");
     b2.hear(&b1.wait(1));
@@ -384,7 +382,8 @@ fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
 
 #[test]
 fn a_candidate_that_never_led_is_silent_when_it_hears_a_leader() {
-    let (mut leader, mut other) = (Candidate::new("leader"), Candidate::new("other"));
+    let mut leader = Candidate::new("leader");
+    let mut other = Candidate::new("other");
     leader.lead(1);
     leader.record(1, "euclid");
     assert_eq!(other.hear(&leader.wait(1)), []);
@@ -408,7 +407,8 @@ fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
 
 #[test]
 fn a_leader_that_has_counted_much_is_believed_in_its_next_rounds() {
-    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    let mut edge = signing("edge", 7, "edge");
+    let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
     (0..100_000).for_each(|_| drop(edge.record(7, "gauss")));
     euclid.hear(&sign(edge.resync.snapshot(&edge.ledger)));
@@ -512,7 +512,8 @@ fn what_was_signed_together_is_taken_together() {
 
 #[test]
 fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
-    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    let mut edge = signing("edge", 7, "edge");
+    let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
     edge.leadership.position = Position::Leading;
     let forged = sign(vec![share("gauss", None, vec![slander(6, "gauss", 1000)])]);
@@ -557,7 +558,8 @@ fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
 
 #[test]
 fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificate() {
-    let (mut euclid, mut gauss) = (signing("other", 7, "edge"), signing("gauss", 8, "leader"));
+    let mut euclid = signing("other", 7, "edge");
+    let mut gauss = signing("gauss", 8, "leader");
     let mut edge = signing("edge", 7, "edge");
     edge.lead(7);
     let mut said = Vec::new();
@@ -568,7 +570,8 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
     euclid.hear(&said);
     euclid.wait_until(EVIDENCE_TRIAL.as_millis() as u64);
     let news = share("leader", Some(8), Vec::new());
-    (euclid.leadership, edge.leadership) = (following(8, "leader"), following(8, "leader"));
+    euclid.leadership = following(8, "leader");
+    edge.leadership = following(8, "leader");
     euclid.hear(std::slice::from_ref(&news));
     let passed_on = euclid.wait(4);
     assert!(
@@ -595,7 +598,8 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
 
 #[test]
 fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_again() {
-    let (mut edge, mut before) = (signing("edge", 8, "leader"), signing("edge", 7, "edge"));
+    let mut edge = signing("edge", 8, "leader");
+    let mut before = signing("edge", 7, "edge");
     before.lead(7);
     before.record(7, "gauss");
     edge.ledger = before.ledger.clone();
@@ -618,7 +622,8 @@ fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_ag
 
 #[test]
 fn statements_that_later_ones_replace_are_dropped() {
-    let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("euclid", 7, "edge"));
+    let mut edge = signing("edge", 7, "edge");
+    let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
     for round in 0..2000 {
         let said = sign(edge.record(7, ["euclid", "gauss", "other"][round % 3]));
@@ -643,7 +648,8 @@ fn statements_that_later_ones_replace_are_dropped() {
 
 #[test]
 fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back() {
-    let (mut leader, mut euclid) = (Candidate::new("leader"), Candidate::new("other"));
+    let mut leader = Candidate::new("leader");
+    let mut euclid = Candidate::new("other");
     leader.lead(7);
     leader.leadership = Leadership {
         position: Position::Leading,
@@ -711,7 +717,8 @@ fn the_votes_after_a_heal_are_the_latest() {
 /// evidence.
 #[test]
 fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
-    let (mut edge, mut gauss) = (Candidate::new("edge"), Candidate::new("gauss"));
+    let mut edge = Candidate::new("edge");
+    let mut gauss = Candidate::new("gauss");
     for candidate in [&mut edge, &mut gauss] {
         candidate.ledger.record(
             1,

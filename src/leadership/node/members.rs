@@ -120,7 +120,8 @@ mod tests {
     #[test]
     fn the_end_of_a_broker_is_understood_for_a_while_after_its_node_was_given_up() {
         let mut members = Members::default();
-        let (edge, broker) = (member("edge", 1), "10.0.0.1:1".parse().unwrap());
+        let edge = member("edge", 1);
+        let broker = "10.0.0.1:1".parse().unwrap();
         members.place(edge.clone());
         assert_eq!(members.at(&broker, at(0)), std::slice::from_ref(&edge.name));
         members.part_with(&edge.name, at(0));

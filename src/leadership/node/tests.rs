@@ -49,7 +49,8 @@ impl Scene {
             status: status(role),
         };
         let machine = LeadershipNode::new(settings, 0, &Leadership::default(), START);
-        let (members, effects) = (Vec::new(), Vec::new());
+        let members = Vec::new();
+        let effects = Vec::new();
         let mut scene = Self {
             machine,
             now: START,
@@ -266,7 +267,8 @@ fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
     scene.members.push(member("edge", 2));
     scene.run_for(1000);
     scene.beat();
-    let (living, earlier) = (Uuid::from_u128(2), Uuid::from_u128(1));
+    let living = Uuid::from_u128(2);
+    let earlier = Uuid::from_u128(1);
     let status = |id, state| NodeStatus {
         node: name("edge"),
         id,
@@ -330,7 +332,8 @@ fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
             "attempt {attempt}"
         );
         for state in [NodeState::Aggregating, NodeState::Offline] {
-            let (node, id) = (name("edge"), Uuid::from_u128(attempt.into()));
+            let node = name("edge");
+            let id = Uuid::from_u128(attempt.into());
             scene.take(Input::StatusHeard {
                 status: NodeStatus {
                     node,
@@ -747,7 +750,8 @@ fn a_follower_without_rights_that_vouches_for_its_leader_declares_nothing() {
         life: LifeSign::default(),
     };
     let mut message = scene.message(Epoch::new(7, name("edge")), body);
-    (message.candidacy.role, message.candidacy.priority) = (Role::Cav, 100);
+    message.candidacy.role = Role::Cav;
+    message.candidacy.priority = 100;
     scene.take(Input::Receive {
         from: name("edge"),
         rights: Rights::NONE,

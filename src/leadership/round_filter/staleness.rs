@@ -65,10 +65,8 @@ impl LeadersDelay {
     fn observe(&mut self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
         let (last_fused_at, last_received_at) =
             std::mem::replace(&mut self.last, (fused_at, received_at));
-        let (made_in, came_in) = (
-            fused_at.since(last_fused_at),
-            received_at.since(last_received_at),
-        );
+        let made_in = fused_at.since(last_fused_at);
+        let came_in = received_at.since(last_received_at);
         self.live_for = if 2 * came_in >= made_in {
             self.live_for + came_in
         } else {
@@ -86,7 +84,8 @@ impl LeadersDelay {
                 delay_us.saturating_sub(longest_wait.as_micros() as i64),
                 received_at,
             );
-            (self.is_bound, self.candidate) = (true, None);
+            self.is_bound = true;
+            self.candidate = None;
         }
         self.least.observe(delay_us, received_at);
         let mut waited =
@@ -183,10 +182,8 @@ mod tests {
     #[test]
     fn rounds_that_waited_are_old_whatever_the_leaders_clock_says() {
         for ahead in [0, 3_600_000] {
-            let (epoch, mut filter) = (
-                Epoch::new(3, NodeName::from_static("edge")),
-                StalenessFilter::new(ms(0)),
-            );
+            let epoch = Epoch::new(3, NodeName::from_static("edge"));
+            let mut filter = StalenessFilter::new(ms(0));
             for round in 0..20 {
                 assert!(
                     filter.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)),
@@ -243,10 +240,8 @@ mod tests {
 
     #[test]
     fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
-        let (edge, gauss) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            Epoch::new(4, NodeName::from_static("gauss")),
-        );
+        let edge = Epoch::new(3, NodeName::from_static("edge"));
+        let gauss = Epoch::new(4, NodeName::from_static("gauss"));
         let mut filter = StalenessFilter::new(ms(0));
         assert!(filter.is_fresh(&edge, ms(0), ms(1)));
         // After a stall of eleven seconds, the old leader emits one more round, followed by its
@@ -265,10 +260,8 @@ mod tests {
     #[test]
     fn a_leader_whose_clock_was_set_is_believed_at_once() {
         for step_ms in [5_000, -5_000, -31_536_000_000_i64] {
-            let (epoch, mut filter) = (
-                Epoch::new(3, NodeName::from_static("edge")),
-                StalenessFilter::new(ms(0)),
-            );
+            let epoch = Epoch::new(3, NodeName::from_static("edge"));
+            let mut filter = StalenessFilter::new(ms(0));
             let refused = (0..100).filter(|n| {
                 let fused_at = ms(100 * n).shifted(if *n < 50 { 0 } else { 1000 * step_ms });
                 !filter.is_fresh(&epoch, fused_at, ms(100 * n + 1))
@@ -279,10 +272,8 @@ mod tests {
 
     #[test]
     fn rounds_that_waited_are_old_though_the_leaders_clock_was_set_back_meanwhile() {
-        let (epoch, mut filter) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            StalenessFilter::new(ms(0)),
-        );
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut filter = StalenessFilter::new(ms(0));
         let made = |n: u64| ms(100 * n).shifted(if n < 30 { 0 } else { -5_000_000 });
         assert!((0..20).all(|n| filter.is_fresh(&epoch, made(n), ms(100 * n + 2))));
         // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst
@@ -295,10 +286,8 @@ mod tests {
 
     #[test]
     fn a_node_that_is_stopped_as_it_starts_takes_only_what_is_made_now() {
-        let (epoch, mut filter) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            StalenessFilter::new(ms(0)),
-        );
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut filter = StalenessFilter::new(ms(0));
         assert!((1..30).all(|n| !filter.is_fresh(&epoch, ms(100 * n), ms(3000))));
         let live: Vec<_> = (30..40)
             .filter(|n| filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + 2)))
@@ -308,10 +297,8 @@ mod tests {
 
     #[test]
     fn a_way_that_became_longer_is_believed_in_the_end() {
-        let (epoch, mut filter) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            StalenessFilter::new(ms(0)),
-        );
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut filter = StalenessFilter::new(ms(0));
         let is_fresh = |n: u64, filter: &mut StalenessFilter| {
             filter.is_fresh(
                 &epoch,
@@ -329,10 +316,8 @@ mod tests {
 
     #[test]
     fn a_clock_that_is_set_back_makes_no_older_rounds_fresh() {
-        let (epoch, mut filter) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            StalenessFilter::new(ms(0)),
-        );
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut filter = StalenessFilter::new(ms(0));
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
             filter.is_fresh(
                 &epoch,
@@ -350,10 +335,8 @@ mod tests {
 
     #[test]
     fn rounds_go_on_after_a_silence_in_which_the_leaders_clock_was_set_back() {
-        let (epoch, mut filter) = (
-            Epoch::new(3, NodeName::from_static("edge")),
-            StalenessFilter::new(ms(0)),
-        );
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut filter = StalenessFilter::new(ms(0));
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
             filter.is_fresh(
                 &epoch,
@@ -370,15 +353,11 @@ mod tests {
 
     #[test]
     fn a_node_that_runs_for_a_moment_between_two_stops_learns_no_delay_from_them() {
-        let (old, new) = (
-            NodeName::from_static("euclid"),
-            NodeName::from_static("edge"),
-        );
-        let (old, new, mut filter) = (
-            Epoch::new(1, old),
-            Epoch::new(2, new),
-            StalenessFilter::new(ms(0)),
-        );
+        let old = NodeName::from_static("euclid");
+        let new = NodeName::from_static("edge");
+        let old = Epoch::new(1, old);
+        let new = Epoch::new(2, new);
+        let mut filter = StalenessFilter::new(ms(0));
         assert!((0..20).all(|round| filter.is_fresh(&old, ms(100 * round), ms(100 * round + 2))));
         // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone
         // passed other checks.

@@ -206,7 +206,8 @@ impl SuccessionFilter {
         }
         self.admit_in_order(epoch, round, received_at, true)?;
         if let Some(elected) = &mut self.elected {
-            (elected.last_round, elected.heard_at) = (Some(round), received_at);
+            elected.last_round = Some(round);
+            elected.heard_at = received_at;
         }
         self.others_since = None;
         Ok(())
@@ -277,8 +278,8 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        (self.newest_at, self.newest_is_retained) =
-            (Some(received_at), is_first && self.is_retained);
+        self.newest_at = Some(received_at);
+        self.newest_is_retained = is_first && self.is_retained;
         Ok(())
     }
 }
@@ -338,7 +339,8 @@ mod tests {
 
     #[test]
     fn a_forged_epoch_does_not_silence_the_elected() {
-        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "gauss"));
+        let elected = epoch(7, "edge");
+        let forged = epoch(u64::MAX, "gauss");
         let leadership = led_by(elected.clone(), Some("euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
         for round in 0..100 {
@@ -354,7 +356,8 @@ mod tests {
 
     #[test]
     fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
-        let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "euclid"));
+        let elected = epoch(7, "edge");
+        let forged = epoch(u64::MAX, "euclid");
         let leadership = led_by(elected.clone(), Some("euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
         let mut lost = Vec::new();
@@ -409,12 +412,11 @@ mod tests {
 
     #[test]
     fn the_next_leader_is_taken_before_word_of_its_election_came() {
-        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let old = epoch(7, "edge");
+        let new = epoch(8, "euclid");
         let mut filter = SuccessionFilter::of_retained(0);
-        let (before, after) = (
-            led_by(old.clone(), Some("euclid")),
-            led_by(new.clone(), None),
-        );
+        let before = led_by(old.clone(), Some("euclid"));
+        let after = led_by(new.clone(), None);
         assert_eq!(filter.admit(&old, 1, at(0), &before), Ok(()));
         assert_eq!(filter.admit(&new, 2, at(100), &before), Ok(()));
         assert_eq!(
@@ -439,7 +441,8 @@ mod tests {
     /// election's messages do.
     #[test]
     fn a_leader_takes_no_round_of_another_beside_its_own_before_it_yields() {
-        let (own, next) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let own = epoch(7, "edge");
+        let next = epoch(8, "euclid");
         let leading = Leadership {
             position: Position::Leading,
             ..led_by(own.clone(), Some("euclid"))
@@ -463,7 +466,8 @@ mod tests {
 
     #[test]
     fn a_forged_round_of_the_elected_epoch_does_not_silence_it() {
-        let (edge, leadership) = (epoch(7, "edge"), led_by(epoch(7, "edge"), Some("euclid")));
+        let edge = epoch(7, "edge");
+        let leadership = led_by(epoch(7, "edge"), Some("euclid"));
         let mut filter = SuccessionFilter::new(0);
         for round in 1..100 {
             assert_eq!(
@@ -486,7 +490,8 @@ mod tests {
 
     #[test]
     fn the_elected_goes_on_in_a_later_term_before_word_of_it_came() {
-        let (before, renewed) = (epoch(7, "edge"), epoch(8, "edge"));
+        let before = epoch(7, "edge");
+        let renewed = epoch(8, "edge");
         let leadership = led_by(before.clone(), Some("euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&before, 41, at(0), &leadership), Ok(()));
@@ -499,7 +504,8 @@ mod tests {
 
     #[test]
     fn a_saved_term_does_not_shut_out_for_good_who_publishes_without_any_election() {
-        let (unelected, leadership) = (epoch(3, "aggregator"), seeking(50));
+        let unelected = epoch(3, "aggregator");
+        let leadership = seeking(50);
         let mut filter = SuccessionFilter::new(50);
         let taken = |round: &u64| {
             filter
@@ -515,7 +521,8 @@ mod tests {
 
     #[test]
     fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
-        let (elected, lone) = (epoch(2, "euclid"), epoch(3, "edge"));
+        let elected = epoch(2, "euclid");
+        let lone = epoch(3, "edge");
         let leadership = led_by(elected.clone(), Some("edge"));
         let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&elected, 42, at(0), &leadership), Ok(()));
@@ -539,7 +546,8 @@ mod tests {
 
     #[test]
     fn who_began_to_lead_at_the_same_time_as_the_elected_waits_for_its_silence() {
-        let (elected, rival) = (epoch(1, "edge"), epoch(1, "v02"));
+        let elected = epoch(1, "edge");
+        let rival = epoch(1, "v02");
         for standby in [None, Some("v02")] {
             let leadership = led_by(elected.clone(), standby);
             let mut filter = SuccessionFilter::new(0);
@@ -570,7 +578,9 @@ mod tests {
 
     #[test]
     fn who_was_taken_before_the_elected_was_known_is_taken_until_the_elected_is_heard() {
-        let (elected, rival, renewed) = (epoch(1, "edge"), epoch(1, "v02"), epoch(2, "edge"));
+        let elected = epoch(1, "edge");
+        let rival = epoch(1, "v02");
+        let renewed = epoch(2, "edge");
         let mut filter = SuccessionFilter::new(0);
         assert_eq!(filter.admit(&rival, 1, at(0), &seeking(1)), Ok(()));
         let leadership = led_by(elected.clone(), None);
@@ -597,7 +607,8 @@ mod tests {
 
     #[test]
     fn the_elected_is_heard_half_a_second_after_a_later_one_that_said_one_word_only() {
-        let (elected, later) = (epoch(6, "euclid"), epoch(6, "gauss"));
+        let elected = epoch(6, "euclid");
+        let later = epoch(6, "gauss");
         let mut filter = SuccessionFilter::new(0);
         assert_eq!(filter.admit(&later, 40, at(0), &seeking(5)), Ok(()));
         let leadership = led_by(elected.clone(), None);
@@ -674,7 +685,8 @@ mod tests {
 
     #[test]
     fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
-        let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
+        let old = epoch(7, "edge");
+        let new = epoch(8, "euclid");
         let mut filter = SuccessionFilter::of_retained(0);
         let after = led_by(new.clone(), None);
         assert_eq!(

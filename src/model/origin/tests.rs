@@ -150,7 +150,8 @@ fn apart_m(one: &GeographicPosition, other: &GeographicPosition) -> f64 {
 #[test]
 fn positions_within_five_kilometres_are_those_of_proj() {
     for ([latitude, longitude, height], [x, y, z], by_proj) in BY_PROJ {
-        let (origin, by_proj) = (at(latitude, longitude, height), position(by_proj));
+        let origin = at(latitude, longitude, height);
+        let by_proj = position(by_proj);
         let there = origin.to_wgs84(x, y, z);
         // The longest degree, so that a point that is near in degrees is also near in metres.
         let degree_m = 111_700.0;

@@ -78,7 +78,8 @@ pub(super) struct Increments {
 
 impl Increments {
     pub(super) fn new(config: &PaceConfig) -> Self {
-        let (p_d, p_f) = (config.detection_probability, config.false_alarm_probability);
+        let p_d = config.detection_probability;
+        let p_f = config.false_alarm_probability;
         Self {
             hit_nats: (p_d / p_f).ln(),
             miss_nats: ((1.0 - p_f) / (1.0 - p_d)).ln(),

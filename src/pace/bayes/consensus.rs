@@ -89,17 +89,16 @@ impl WeightedMean {
     pub(super) fn add(&mut self, position: &Point2<f64>, covariance: &Covariance, floor_m: f64) {
         let Covariance { xx, xy, yy } = *covariance + Covariance::isotropic(floor_m);
         let per_determinant = 1.0 / (xx * yy - xy * xy);
-        let (xx, xy, yy) = (
-            yy * per_determinant,
-            -xy * per_determinant,
-            xx * per_determinant,
-        );
-        self.xx += xx;
-        self.xy += xy;
-        self.yy += yy;
+        // The inverse of the covariance.
+        let weight_xx = yy * per_determinant;
+        let weight_xy = -xy * per_determinant;
+        let weight_yy = xx * per_determinant;
+        self.xx += weight_xx;
+        self.xy += weight_xy;
+        self.yy += weight_yy;
         self.sum += Vector2::new(
-            xx * position.x + xy * position.y,
-            xy * position.x + yy * position.y,
+            weight_xx * position.x + weight_xy * position.y,
+            weight_xy * position.x + weight_yy * position.y,
         );
     }
 
@@ -118,7 +117,8 @@ mod tests {
 
     #[test]
     fn a_label_that_is_no_longer_believed_gives_way_to_one_that_is() {
-        let (car, van) = (Label::from("car"), Label::from("van"));
+        let car = Label::from("car");
+        let van = Label::from("van");
         let winner = |nats_of_car: f64| {
             let scores = LabelScores {
                 labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect(),

@@ -62,9 +62,11 @@ impl LandmarkIndex {
             .iter()
             .enumerate()
             .filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
-        let (mut low, mut high) = (Point2::from([f64::MAX; 2]), Point2::from([f64::MIN; 2]));
+        let mut low = Point2::from([f64::MAX; 2]);
+        let mut high = Point2::from([f64::MIN; 2]);
         for Landmark { position, .. } in &landmarks {
-            (low, high) = (low.inf(position), high.sup(position));
+            low = low.inf(position);
+            high = high.sup(position);
         }
         Self {
             corners: [low, high],

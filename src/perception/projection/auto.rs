@@ -17,7 +17,8 @@ pub(super) fn line_of_sight(
     size: Option<&ObjectSize>,
     projection: &Projection,
 ) -> Result<LineOfSight, ProjectionError> {
-    let (label, bounds) = (&detection.label, &detection.bounding_box);
+    let label = &detection.label;
+    let bounds = &detection.bounding_box;
     let unknown_size = || ProjectionError::UnknownSize(label.clone());
     let clipped = || ProjectionError::Clipped(label.clone());
     let (foot, head) = box_height::foot_and_head(bounds, projection);

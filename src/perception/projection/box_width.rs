@@ -19,7 +19,8 @@ pub(super) fn line_of_sight(
                 .ray(&Point2::new(x_px, bounds.center().y));
         ray.y.atan2(ray.x)
     };
-    let (left, right) = (bearing(bounds.x_min), bearing(bounds.x_max));
+    let left = bearing(bounds.x_min);
+    let right = bearing(bounds.x_max);
     let half_alpha = (left - right) / 2.0;
     projection.sized(
         (left + right) / 2.0,

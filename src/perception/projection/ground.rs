@@ -25,7 +25,8 @@ impl HalfDepth {
     /// φ| + w |sin φ|) / 2.
     pub(super) fn of_size(size: &ObjectSize) -> Self {
         use std::f64::consts::PI;
-        let (width, length) = (size.width_m, size.length_m.unwrap_or(size.width_m));
+        let width = size.width_m;
+        let length = size.length_m.unwrap_or(size.width_m);
         let mean_m = (length + width) / PI;
         let mean_square = (length * length + width * width) / 8.0 + length * width / (2.0 * PI);
         let spread = (mean_square - mean_m * mean_m).max(0.0).sqrt();

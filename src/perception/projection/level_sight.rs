@@ -54,7 +54,8 @@ impl LevelSight {
             ),
             (Some(Source::Roll), axis.cross(&ray) * config.tilt_sigma_rad),
         ];
-        let (mut errors, mut variance) = (Errors::zeros(), 0.0);
+        let mut errors = Errors::zeros();
+        let mut variance = 0.0;
         for (source, change) in turns {
             if let Some(source) = source {
                 let outward = (ray.x * change.x + ray.y * change.y) / square;
@@ -64,10 +65,8 @@ impl LevelSight {
         }
         // The row's direction on the ground, up to scale.
         let along_row = to_level * Vector3::new(1.0, 0.0, 0.0);
-        let (forward, left) = (
-            ray.x * along_row.z - ray.z * along_row.x,
-            ray.y * along_row.z - ray.z * along_row.y,
-        );
+        let forward = ray.x * along_row.z - ray.z * along_row.x;
+        let left = ray.y * along_row.z - ray.z * along_row.y;
         let depth_factor = (forward.hypot(left) * level / (ray.x * left - ray.y * forward).abs())
             .min(MAX_DEPTH_FACTOR);
         Self {

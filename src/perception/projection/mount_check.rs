@@ -84,7 +84,8 @@ impl MountCheck {
             values
         };
         let slopes = sorted(|offset| offset.expected_slope);
-        let (count, tenth) = (slopes.len(), slopes.len() / 10);
+        let count = slopes.len();
+        let tenth = slopes.len() / 10;
         let time = self
             .offsets
             .back()?
@@ -125,10 +126,8 @@ impl Projection {
         if !stands || !is_grounded || !bounds.is_valid() || cut.upper || cut.lower {
             return None;
         }
-        let (camera_m, size) = (
-            self.mount.height_m?,
-            self.config.sizes.of(&detection.label)?,
-        );
+        let camera_m = self.mount.height_m?;
+        let size = self.config.sizes.of(&detection.label)?;
         let (foot, head) = box_height::foot_and_head(bounds, self);
         let half = HalfDepth::of_size(size);
         let upright = box_height::upright(&foot, &head, size, half)?;

@@ -167,7 +167,9 @@ struct PersonBox {
 /// All boxes, and the number of people. A box belongs to the same person as the box of the previous
 /// frame with which it overlaps most.
 fn linked(frames: &[Vec<BoundingBox>]) -> (Vec<PersonBox>, usize) {
-    let (mut all, mut before, mut people) = (Vec::new(), Vec::<PersonBox>::new(), 0);
+    let mut all = Vec::new();
+    let mut before = Vec::<PersonBox>::new();
+    let mut people = 0;
     for frame in frames {
         let mut now = Vec::with_capacity(frame.len());
         for bounding_box in frame {
@@ -297,21 +299,17 @@ impl HeightFit {
     /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the
     /// heights of the people relative to the mean.
     fn errors(&self, at: &Vector3<f64>, grown: &[f64]) -> Vec<Option<HeadError>> {
-        let (projection, height_m, half) = (
-            self.projection(at),
-            at.z.exp(),
-            HalfDepth::of_size(&self.size),
-        );
+        let projection = self.projection(at);
+        let height_m = at.z.exp();
+        let half = HalfDepth::of_size(&self.size);
         let error = |person: &PersonBox| {
             let (foot, head) = box_height::foot_and_head(&person.bounding_box, &projection);
             if foot.slope <= MIN_SLOPE {
                 return None;
             }
             // The foot is the near edge of a person, and the head is above the middle.
-            let (near_m, drop_m) = (
-                height_m / foot.slope,
-                height_m - self.size.height_m * grown[person.person],
-            );
+            let near_m = height_m / foot.slope;
+            let drop_m = height_m - self.size.height_m * grown[person.person];
             let head_m = near_m + half.mean_m * foot.depth_factor;
             let by_distance = drop_m / (head_m * head_m);
             let by_height = self.size.height_m / head_m;

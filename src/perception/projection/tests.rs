@@ -40,7 +40,8 @@ fn detection(bounding_box: BoundingBox) -> Detection {
 /// The box of an upright board of side `SIDE_M` whose middle is at `range_m` and `bearing_rad` and
 /// whose normal is turned by `yaw_rad` from the camera's axis.
 fn board(range_m: f64, bearing_rad: f64, yaw_rad: f64) -> BoundingBox {
-    let (forward, left) = (range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
+    let forward = range_m * bearing_rad.cos();
+    let left = range_m * bearing_rad.sin();
     let half = SIDE_M / 2.0;
     let corners =
         [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(along, down)| {

@@ -47,12 +47,14 @@ fn crowd(missed: f64) -> Crowd {
             for person in 0..PEOPLE {
                 if !rng.random_bool(missed) {
                     let seen = place(person, t_s);
-                    let (x_m, y_m) = (seen.x + noise(&mut rng, 0.2), seen.y + noise(&mut rng, 0.2));
+                    let x_m = seen.x + noise(&mut rng, 0.2);
+                    let y_m = seen.y + noise(&mut rng, 0.2);
                     objects.push(PerceivedObject::new("person", 0.8, x_m, y_m));
                 }
             }
             if rng.random_bool(0.5) {
-                let (x_m, y_m) = (noise(&mut rng, 7.0), noise(&mut rng, 7.0));
+                let x_m = noise(&mut rng, 7.0);
+                let y_m = noise(&mut rng, 7.0);
                 objects.push(PerceivedObject::new("person", 0.6, x_m, y_m));
             }
             let seen = ObjectReport {

@@ -24,7 +24,8 @@ fn highway(stamped_late_us: u64) -> Vector2<f64> {
                 let cars =
                     (from..from + 5).map(|car| first_m + 25.0 * car as f64 + speed_mps * t_s);
                 objects.extend(cars.filter(|car_m| (car_m - x_m).abs() > 4.0).map(|x_m| {
-                    let (x_m, y_m) = (x_m + noise(&mut rng, 0.2), y_m + noise(&mut rng, 0.2));
+                    let x_m = x_m + noise(&mut rng, 0.2);
+                    let y_m = y_m + noise(&mut rng, 0.2);
                     car(x_m, y_m)
                 }));
             }
@@ -141,7 +142,8 @@ fn a_glimpse_of_something_far_away_widens_no_view() {
 fn error_in_a_frame_that_turns(yaw_rate_radps: f64) -> f64 {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let mut tracker = tracker();
-    let (mut place, mut errors) = (Vector2::new(3.0, 5.0), Vec::new());
+    let mut place = Vector2::new(3.0, 5.0);
+    let mut errors = Vec::new();
     for frame in 0..150 {
         let t_s = frame as f64 * 0.1;
         let heading = nalgebra::Rotation2::new(yaw_rate_radps * t_s);

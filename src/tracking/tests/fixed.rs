@@ -35,7 +35,8 @@ impl Camera {
         let mut objects = Vec::new();
         for person in people {
             let seen = self.place + self.offset + turned * (person - self.place);
-            let (x_m, y_m) = (seen.x + noise(rng, 0.3), seen.y + noise(rng, 0.3));
+            let x_m = seen.x + noise(rng, 0.3);
+            let y_m = seen.y + noise(rng, 0.3);
             if rng.random_bool(0.9) {
                 objects.push(PerceivedObject::new("person", 0.8, x_m, y_m));
             }
@@ -115,7 +116,8 @@ fn nothing_moves_the_map_of_fixed_cameras() {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let cameras = Camera::around(count, is_posed, &mut rng);
         let mut tracker = tracker();
-        let (mut sums, mut rounds) = ([0.0; 5], 0.0);
+        let mut sums = [0.0; 5];
+        let mut rounds = 0.0;
         for frame in (0..36_000).step_by(5) {
             for camera in &cameras {
                 tracker.observe(camera.report(frame, &people(frame), &mut rng), at(frame));
@@ -214,7 +216,8 @@ fn a_camera_does_not_take_over_the_error_of_a_vehicle_however_often_it_reports()
         let mut rng = ChaCha8Rng::seed_from_u64(7);
         let mut observers = Camera::around(2, true, &mut rng);
         for (observer, east_m) in observers.iter_mut().zip([0.0, 0.4]) {
-            (observer.offset, observer.turned_rad) = (Vector2::new(east_m, 0.0), 0.0);
+            observer.offset = Vector2::new(east_m, 0.0);
+            observer.turned_rad = 0.0;
         }
         let mut tracker = tracker();
         let mut corrected_m = Vec::new();
@@ -272,7 +275,8 @@ fn the_map_stays_where_it_is_when_a_camera_leaves() {
     let mut cameras = Camera::around(3, true, &mut rng);
     cameras[2].offset.x += 0.9;
     let mut tracker = tracker();
-    let (mut with, mut without) = (Vec::new(), Vec::new());
+    let mut with = Vec::new();
+    let mut without = Vec::new();
     for frame in 0..900 {
         for camera in &cameras[..if frame < 600 { 3 } else { 2 }] {
             tracker.observe(camera.report(frame, &people(0), &mut rng), at(frame));
@@ -300,7 +304,9 @@ fn a_camera_that_joins_an_hour_later_is_aligned_and_does_not_pull_the_others() {
         let mut cameras = Camera::around(3, is_posed, &mut rng);
         cameras[2].offset.x += 0.9;
         let mut tracker = tracker();
-        let (mut before, mut after, mut rest_m) = (Vec::new(), Vec::new(), 0.0_f64);
+        let mut before = Vec::new();
+        let mut after = Vec::new();
+        let mut rest_m = 0.0_f64;
         for frame in (0..39_000).step_by(5) {
             let people = people(frame);
             for camera in &cameras[..if frame < 36_000 { 2 } else { 3 }] {

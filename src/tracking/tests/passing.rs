@@ -159,7 +159,8 @@ fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
 
 #[test]
 fn a_heading_of_another_aggregator_gives_way_to_the_course() {
-    let (mut leader, mut newcomer) = (tracker(), tracker());
+    let mut leader = tracker();
+    let mut newcomer = tracker();
     let drive =
         |tracker: &mut Tracker, frames: std::ops::Range<u64>, place: fn(f64) -> [f64; 2]| {
             let mut round = TracksRound::default();

@@ -227,11 +227,9 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
 #[test]
 fn a_vehicle_that_invents_objects_makes_those_of_others_hardly_less_sure() {
     let least_existence = |invented: usize| {
-        let (mut tracker, mut rng, mut round) = (
-            tracker(),
-            ChaCha8Rng::seed_from_u64(1),
-            TracksRound::default(),
-        );
+        let mut tracker = tracker();
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut round = TracksRound::default();
         for frame in 0..50 {
             tracker.observe(
                 report(
@@ -252,7 +250,8 @@ fn a_vehicle_that_invents_objects_makes_those_of_others_hardly_less_sure() {
         cars.map(|object| object.existence.unwrap())
             .fold(1.0, f64::min)
     };
-    let (without, beside) = (least_existence(0), least_existence(300));
+    let without = least_existence(0);
+    let beside = least_existence(300);
     assert!(
         without > 0.5 && beside > without - 0.1,
         "{without:.2} without, {beside:.2} beside 300 invented ones a frame"

@@ -96,7 +96,8 @@ impl WeightedVoting {
                 let correct = landmark_votes.published == Some(vote.label);
                 self.counts[vote.vehicle].add(correct);
                 if vote.at >= self.recorded_from {
-                    let (node, label) = (&self.names[vote.vehicle], self.labels.name(vote.label));
+                    let node = &self.names[vote.vehicle];
+                    let label = self.labels.name(vote.label);
                     self.evidence.push(Evidence {
                         node: node.clone(),
                         label: label.clone(),
@@ -106,7 +107,9 @@ impl WeightedVoting {
             }
         }
         for vote in &mut landmark_votes.votes {
-            (vote.since, vote.judged, vote.compared) = (vote.at, false, false);
+            vote.since = vote.at;
+            vote.judged = false;
+            vote.compared = false;
         }
         self.changed.insert(landmark);
     }

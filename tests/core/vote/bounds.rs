@@ -107,7 +107,8 @@ proptest! {
             reports.iter().for_each(|report| vote.observe(report, START).unwrap());
             vote.close(START).verdicts
         };
-        let (one, other) = (run(&all.iter().collect::<Vec<_>>()), run(&shuffled));
+        let one = run(&all.iter().collect::<Vec<_>>());
+        let other = run(&shuffled);
         let other: BTreeMap<_, _> = other.into_iter().map(|v| (v.landmark.clone(), v)).collect();
         for verdict in one {
             let again = &other[&verdict.landmark];

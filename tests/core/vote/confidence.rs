@@ -17,7 +17,8 @@ const LABELS: usize = 4;
 /// Items right in percent, online in one pass and after refinement, over two seeds, where a vote that is right with
 /// probability `p` states the confidence that `state` gives for (vehicle, p, a random number).
 fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
-    let (mut online, mut refined) = (0, 0);
+    let mut online = 0;
+    let mut refined = 0;
     let right = |v: &Verdict, truths: &[usize]| {
         let item: usize = v.landmark.as_str().parse().unwrap();
         v.label.as_deref() == Some(truths[item].to_string().as_str())

@@ -82,7 +82,9 @@ impl Score {
 
     fn row(&self, number: u64, kind: &Kind) -> String {
         let of = |d: Difference| format!("{:+.2} ± {:.2}", d.points(), d.standard_error());
-        let (majority, online, passes) = (self.majority, of(self.online), of(self.passes));
+        let majority = self.majority;
+        let online = of(self.online);
+        let passes = of(self.passes);
         let beside = of(self.passes_beside_online);
         format!(
             "set {number}: majority {majority:.2} %, online {online}, passes {passes}, passes - online {beside}; {kind:?}"

@@ -34,7 +34,8 @@ impl Reference {
     fn observe(&mut self, (vehicle, (x, y, heading), detections): &Report) {
         let reputation = *self.reputations.entry(*vehicle).or_insert(0.5);
         for &(place, label, confidence) in detections {
-            let (dx, dy) = (PLACES[place].0 - x, PLACES[place].1 - y);
+            let dx = PLACES[place].0 - x;
+            let dy = PLACES[place].1 - y;
             let distance = (dx * dx + dy * dy).sqrt();
             if distance > 2.54 || confidence <= 0.0 {
                 continue;

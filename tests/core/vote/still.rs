@@ -28,7 +28,8 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
         .map(|_| rng.random_range(0..LABELS.len()))
         .collect();
     let mut now = Timestamp(1_700_000_000_000_000);
-    let (mut right, mut changes) = (0, 0);
+    let mut right = 0;
+    let mut changes = 0;
     let mut shown = vec![None; cell.landmarks];
     for round in 0..ROUNDS {
         now = now + PERIOD;

@@ -104,7 +104,8 @@ impl World {
             return;
         }
         let vehicle = self.random.index(VEHICLES);
-        let (node, correct) = (self.nodes[vehicle].name.clone(), self.random.chance(90));
+        let node = self.nodes[vehicle].name.clone();
+        let correct = self.random.chance(90);
         let leader = &mut self.nodes[index];
         let lane = leader.resync.lane_in(epoch, &leader.ledger);
         leader.lane = Some(lane.clone());

@@ -21,7 +21,9 @@ pub(super) fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64>
         let settle = world.random.between(0, 200 * MS);
         world.run_for(9 * SECOND + settle);
         one_best_leader(world)?;
-        let (leader, changes, from) = (world.leaders()[0], world.led.len(), world.now);
+        let leader = world.leaders()[0];
+        let changes = world.led.len();
+        let from = world.now;
         world.plan(0, Fault::Kill { node: leader, seen });
         if victims > 1 {
             let standby = world.nodes[leader].standby().cloned();

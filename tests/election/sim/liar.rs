@@ -555,7 +555,8 @@ fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life
         if world.nodes[to].paused_until > world.now {
             continue;
         }
-        let (from, message) = (name.clone(), message.clone());
+        let from = name.clone();
+        let message = message.clone();
         // As in its certificate.
         let rights = Rights {
             role,

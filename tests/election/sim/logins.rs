@@ -124,7 +124,8 @@ fn one_node_that_cannot_log_in_moves_no_lead() {
         start_all(&mut world);
         check(&mut world, seed, |world| {
             world.run_for(9 * SECOND);
-            let (leader, nodes) = (world.leaders()[0], world.nodes.len());
+            let leader = world.leaders()[0];
+            let nodes = world.nodes.len();
             let node = (leader + 1) % nodes;
             let rank = |node: usize| {
                 (

@@ -235,7 +235,9 @@ impl Node {
         self.started_at = now;
         self.paused_until = 0;
         self.steady_clock = self.clock;
-        (self.broker_works, self.fuser_works, self.gateway_works) = (true, true, true);
+        self.broker_works = true;
+        self.fuser_works = true;
+        self.gateway_works = true;
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.lane = None;
@@ -297,7 +299,8 @@ impl Node {
 
     /// Lets the fuser stop, or close rounds again.
     pub(crate) fn set_fuser(&mut self, works: bool, now: u64) {
-        (self.closed, self.fuser_works) = ((self.rounds_due(now), now), works);
+        self.closed = (self.rounds_due(now), now);
+        self.fuser_works = works;
     }
 
     /// Rounds that the fuser has closed by `now`, published or not.

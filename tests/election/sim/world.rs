@@ -477,7 +477,8 @@ impl World {
             }
             Effect::HoldRound => self.nodes[index].rounds.hold(),
             Effect::StopPublishing { .. } => {
-                (self.nodes[index].publishing, self.nodes[index].lane) = (None, None);
+                self.nodes[index].publishing = None;
+                self.nodes[index].lane = None;
                 self.nodes[index].resync.step_down();
             }
             Effect::SendSnapshot { .. } => self.share_all(index),

@@ -61,7 +61,8 @@ impl MapLog {
         if let Err(error) = self.write(map) {
             self.file = None;
             self.retry_at = map.received_at + RETRY_PAUSE;
-            let (path, retry_in) = (self.path.display(), RETRY_PAUSE.as_secs());
+            let path = self.path.display();
+            let retry_in = RETRY_PAUSE.as_secs();
             tracing::warn!(%path, %error, retry_in_s = retry_in, "maps are not logged; make room, or change `map_log`");
         }
     }

@@ -73,7 +73,8 @@ impl LatestReportQueue {
         let QueuedReport { kind, report } = &delivery.message;
         let mut waiting = self.waiting();
         let is_first = waiting.reports.is_empty();
-        let (key, captured_at) = ((report.node.clone(), *kind), report.captured_at_us);
+        let key = (report.node.clone(), *kind);
+        let captured_at = report.captured_at_us;
         if waiting
             .places
             .get(&key)

@@ -56,7 +56,8 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         ..Leadership::default()
     };
     for leadership in [elected, seeking] {
-        let ((fuser, mut told), newest) = (listening::slot().await, Newest::default());
+        let (fuser, mut told) = listening::slot().await;
+        let newest = Newest::default();
         let arguments = FollowerArguments {
             newest: newest.clone(),
             log: None,
@@ -322,7 +323,8 @@ fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
             ("gauss", n as f64, true),
         ] {
             let mut report = ObjectReport::new(NodeName::from_static(name), n, at);
-            (report.pose, report.moving) = (Some(WirePose::new(x_m, 0.0, 0.0)), Some(moving));
+            report.pose = Some(WirePose::new(x_m, 0.0, 0.0));
+            report.moving = Some(moving);
             take(&mut fuser, report, at, None);
         }
     }

@@ -367,7 +367,8 @@ impl ElectionDriver {
     /// Records troubles: wrong clocks, missing nodes, the leader's complaint, the end of the node's
     /// own certificate, and an unused description of the cell.
     fn note_troubles(&mut self) {
-        let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
+        let troubles = self.counters.troubles();
+        let leadership = self.leadership.borrow();
         let mut is_clock_wrong = false;
         for clock in self.cell_time.wrong_clocks(clock::now()) {
             is_clock_wrong |= clock.node.is_none();
@@ -424,7 +425,8 @@ impl ElectionDriver {
             has_moved
         });
         if has_moved {
-            let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
+            let epoch = epoch.as_ref().map(display);
+            let standby = standby.as_ref().map(display);
             tracing::info!(
                 %position,
                 leader = epoch,
@@ -493,7 +495,8 @@ fn missing_words(absence: Duration, wall: Timestamp) -> String {
 
 /// Records that the node's certificate ends soon and is not renewed, and that the cell's CA ends.
 fn note_certificates(credentials: &Credentials, troubles: &Troubles) {
-    let (current, now) = (credentials.current(), clock::wall());
+    let current = credentials.current();
+    let now = clock::wall();
     let left = current.identity.due_for_renewal(now);
     match left.zip(credentials.unrenewed()) {
         Some((left, why)) => {

@@ -32,11 +32,9 @@ pub(super) fn ask_parts(
     certificate_ends: bool,
     election: ActorRef<LeaderElectionMessage>,
 ) {
-    let (broker, gateway, fuser) = (
-        parts.broker.clone(),
-        parts.gateway.clone(),
-        parts.fuser.clone(),
-    );
+    let broker = parts.broker.clone();
+    let gateway = parts.gateway.clone();
+    let fuser = parts.fuser.clone();
     let fuser_runs = parts
         .fuser
         .get()

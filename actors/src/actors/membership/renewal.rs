@@ -163,7 +163,8 @@ impl Renewals {
                 if !pending.key.is_in(&renewed) {
                     return None;
                 }
-                let (key, credentials) = (Arc::clone(&pending.key), Arc::clone(&self.credentials));
+                let key = Arc::clone(&pending.key);
+                let credentials = Arc::clone(&self.credentials);
                 self.is_replacing = true;
                 Some(RenewalStep::Work(Box::new(move || {
                     let installed = key.install(&renewed, &credentials);
@@ -275,7 +276,8 @@ mod tests {
     /// The renewals of `euclid`, whose certificate has one day left, in a directory without the
     /// key of the CA.
     fn renewals(directory: &tempfile::TempDir) -> Renewals {
-        let (now, cell) = (clock::wall(), NodeName::from_static("lot"));
+        let now = clock::wall();
+        let cell = NodeName::from_static("lot");
         let mut authority = Authority::init(directory.path(), &cell, now).unwrap();
         authority
             .issue(&EUCLID, Role::Auto, 10 * DAY, now - 9 * DAY)

@@ -181,7 +181,8 @@ impl Saved {
         certificate: Option<&String>,
         arguments: &ReputationKeeperArguments,
     ) -> Self {
-        let (ledger, signed) = (&store.ledger, arguments.credentials.is_some());
+        let ledger = &store.ledger;
+        let signed = arguments.credentials.is_some();
         let is_kept = |term: u64, aggregator: &NodeName| {
             !signed
                 || (*aggregator == arguments.name

@@ -30,7 +30,9 @@ fn member(node: &str, role: Role) -> Member {
 }
 
 fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
-    let (aggregator, node, label) = (name(aggregator), name("gauss"), "cup".into());
+    let aggregator = name(aggregator);
+    let node = name("gauss");
+    let label = "cup".into();
     LedgerEntry {
         epoch,
         aggregator,
@@ -176,7 +178,8 @@ impl Certificates {
             .issue(&name(node), Role::Auto, day, clock::now())
             .unwrap();
         let (certificate, key) = self.authority.files_of(&name(node));
-        let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
+        let ca = self.authority.ca();
+        let list = self.authority.revocation_list();
         let files = TlsConfig {
             ca,
             certificate,

@@ -148,13 +148,13 @@ fn solve(
 ) -> Result<Option<Solution>, opencv::Error> {
     let place = |point: &GroundPoint| Point3d::new(point.place.x, point.place.y, 0.0);
     let pixel = |point: &GroundPoint| Point2d::new(point.pixel.x, point.pixel.y);
-    let (places, pixels): (Vector<Point3d>, Vector<Point2d>) = (
-        points.iter().map(place).collect(),
-        points.iter().map(pixel).collect(),
-    );
-    let (camera, undistorted) = (camera_matrix(intrinsics), Mat::default());
-    let (mut rotation, mut translation, mut inliers) =
-        (Mat::default(), Mat::default(), Vector::<i32>::new());
+    let places: Vector<Point3d> = points.iter().map(place).collect();
+    let pixels: Vector<Point2d> = points.iter().map(pixel).collect();
+    let camera = camera_matrix(intrinsics);
+    let undistorted = Mat::default();
+    let mut rotation = Mat::default();
+    let mut translation = Mat::default();
+    let mut inliers = Vector::<i32>::new();
     let is_solved = calib3d::solve_pnp_ransac(
         &places,
         &pixels,
@@ -213,7 +213,9 @@ fn from_extrinsics(from_ground: &Matrix3<f64>, origin: &Vector3<f64>) -> (Pose, 
     let to_ground = from_ground.transpose();
     let position = -(to_ground * origin);
     // The last row of `Mount::to_level` is free of the heading.
-    let (right_up, down_up, ahead_up) = (to_ground[(2, 0)], to_ground[(2, 1)], to_ground[(2, 2)]);
+    let right_up = to_ground[(2, 0)];
+    let down_up = to_ground[(2, 1)];
+    let ahead_up = to_ground[(2, 2)];
     let mount = Mount {
         height_m: Some(position.z),
         pitch_rad: (-ahead_up).clamp(-1.0, 1.0).asin(),

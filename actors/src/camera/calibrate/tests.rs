@@ -14,7 +14,8 @@ const SQUARE_PX: i32 = 40;
 
 /// A board of black and white squares with a white rim, drawn flat.
 fn flat_board() -> Mat {
-    let (columns, rows) = (i32::from(BOARD.columns) + 1, i32::from(BOARD.rows) + 1);
+    let columns = i32::from(BOARD.columns) + 1;
+    let rows = i32::from(BOARD.rows) + 1;
     let white = Scalar::all(255.0);
     let mut image = Mat::new_rows_cols_with_default(
         (rows + 2) * SQUARE_PX,
@@ -49,7 +50,8 @@ fn photograph(flat: &Mat, turn: [f64; 3], shift_mm: [f64; 2], distance_mm: f64) 
     let rotation = Rotation3::from_euler_angles(pitch, yaw, roll);
     let middle = Vector3::new(shift_mm[0], shift_mm[1], distance_mm);
     let mm_per_px = BOARD.square_mm / f64::from(SQUARE_PX);
-    let (half_width, half_height) = (f64::from(flat.cols()) / 2.0, f64::from(flat.rows()) / 2.0);
+    let half_width = f64::from(flat.cols()) / 2.0;
+    let half_height = f64::from(flat.rows()) / 2.0;
     // Pixels of the drawn board to the plane z = 0 of the board, in millimetres.
     let plane = Matrix3::new(
         mm_per_px,

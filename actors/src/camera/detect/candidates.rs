@@ -18,8 +18,10 @@ impl ScoredBox {
     /// NaN.
     pub(super) fn inside(mut self, width: f64, height: f64) -> Option<Self> {
         let b = &mut self.bounds;
-        (b.x_min, b.x_max) = (b.x_min.clamp(0.0, width), b.x_max.clamp(0.0, width));
-        (b.y_min, b.y_max) = (b.y_min.clamp(0.0, height), b.y_max.clamp(0.0, height));
+        b.x_min = b.x_min.clamp(0.0, width);
+        b.x_max = b.x_max.clamp(0.0, width);
+        b.y_min = b.y_min.clamp(0.0, height);
+        b.y_max = b.y_max.clamp(0.0, height);
         b.is_valid().then_some(self)
     }
 

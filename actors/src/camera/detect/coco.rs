@@ -160,7 +160,8 @@ impl CocoDetector {
 
     /// Runs the network on one image. Boxes are in shares of its sides.
     fn run_network(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
-        let (scale, middle) = (1.0 / 127.5, Scalar::all(127.5));
+        let scale = 1.0 / 127.5;
+        let middle = Scalar::all(127.5);
         let blob = dnn::blob_from_image(
             image,
             scale,
@@ -174,9 +175,12 @@ impl CocoDetector {
         let mut outputs = Vector::<Mat>::new();
         let names: Vector<String> = ["boxes", "scores"].into_iter().collect();
         self.net.forward(&mut outputs, &names)?;
-        let (boxes, scores) = (outputs.get(0)?, outputs.get(1)?);
-        let (boxes, scores) = (boxes.data_typed::<f32>()?, scores.data_typed::<f32>()?);
-        let (count, classes) = (self.anchors.len(), labels::CLASSES);
+        let boxes = outputs.get(0)?;
+        let scores = outputs.get(1)?;
+        let boxes = boxes.data_typed::<f32>()?;
+        let scores = scores.data_typed::<f32>()?;
+        let count = self.anchors.len();
+        let classes = labels::CLASSES;
         if boxes.len() != count * 4 || scores.len() != count * classes {
             let message = format!("outputs of {} and {} numbers", boxes.len(), scores.len());
             return Err(opencv::Error::new(opencv::core::StsUnmatchedSizes, message));
@@ -200,15 +204,16 @@ impl CocoDetector {
     }
 
     fn run_on_image(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
-        let (width, height) = (f64::from(image.cols()), f64::from(image.rows()));
+        let width = f64::from(image.cols());
+        let height = f64::from(image.rows());
         let mut found = self.run_network(image)?;
         for candidate in &mut found {
             candidate.bounds = placed(&candidate.bounds, 0.0, 0.0, width, height);
         }
         if self.config.tiling {
             for (right, lower) in [(false, false), (true, false), (false, true), (true, true)] {
-                let (tile_width, tile_height) =
-                    ((width * TILE_SHARE).floor(), (height * TILE_SHARE).floor());
+                let tile_width = (width * TILE_SHARE).floor();
+                let tile_height = (height * TILE_SHARE).floor();
                 let x = if right { width - tile_width } else { 0.0 };
                 let y = if lower { height - tile_height } else { 0.0 };
                 let area = Rect::new(x as i32, y as i32, tile_width as i32, tile_height as i32);

@@ -255,7 +255,8 @@ fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
         return image.try_clone();
     }
     let mut enlarged = Mat::default();
-    let (size, interpolation) = (Size::default(), imgproc::INTER_CUBIC);
+    let size = Size::default();
+    let interpolation = imgproc::INTER_CUBIC;
     imgproc::resize(
         image,
         &mut enlarged,

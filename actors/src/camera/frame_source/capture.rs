@@ -122,7 +122,8 @@ impl Capture {
             readers: Readers::default(),
         };
         let readers = capture.readers.clone();
-        let (unusable, failures) = (Arc::clone(&capture.unusable), Arc::clone(&capture.failures));
+        let unusable = Arc::clone(&capture.unusable);
+        let failures = Arc::clone(&capture.failures);
         thread::Builder::new()
             .name("capture".into())
             .spawn(move || capture.run())?;

@@ -240,8 +240,10 @@ struct LastWords {
 
 impl LastWords {
     fn collect(source: &SourceConfig, stderr: ChildStderr) -> io::Result<Self> {
-        let (line, (until, ended)) = (Arc::<Mutex<String>>::default(), mpsc::channel());
-        let (source, last) = (source.clone(), Arc::clone(&line));
+        let line = Arc::<Mutex<String>>::default();
+        let (until, ended) = mpsc::channel();
+        let source = source.clone();
+        let last = Arc::clone(&line);
         thread::Builder::new()
             .name("video-log".into())
             .spawn(move || log(&source, stderr, &last, &until))?;

@@ -66,7 +66,8 @@ fn a_photograph_is_turned_upright_as_its_camera_says() {
             is_near(color_at(&image, row, column), RED),
             "orientation {orientation}"
         );
-        let (opposite_row, opposite_column) = (size.0 - 1 - row, size.1 - 1 - column);
+        let opposite_row = size.0 - 1 - row;
+        let opposite_column = size.1 - 1 - column;
         assert!(
             is_near(color_at(&image, opposite_row, opposite_column), BLUE),
             "orientation {orientation}"

@@ -269,7 +269,8 @@ impl PointsArguments {
                 }
             }
         }
-        let (picture, vehicle) = (self.picture(&lens)?, self.vehicle(&config)?);
+        let picture = self.picture(&lens)?;
+        let vehicle = self.vehicle(&config)?;
         let fit = fit_mount_to_points(&stated, picture, &lens, &vehicle)
             .context("the points give no mount")?;
         for (
@@ -334,8 +335,9 @@ impl GroundBoardArguments {
         let board = match (self.qr_side_mm, self.square_mm) {
             (Some(side_mm), _) => GroundBoard::QrCode { side_mm },
             (None, square_mm) => {
-                let (columns, rows, square_mm) =
-                    (self.columns, self.rows, square_mm.unwrap_or_default());
+                let columns = self.columns;
+                let rows = self.rows;
+                let square_mm = square_mm.unwrap_or_default();
                 GroundBoard::Chessboard(Chessboard {
                     columns,
                     rows,
@@ -402,7 +404,8 @@ impl PeopleArguments {
             self.label,
             watched.people.len()
         );
-        let (sigma_px, intrinsics) = (camera.projection.pixel_sigma_px, watched.lens.intrinsics);
+        let sigma_px = camera.projection.pixel_sigma_px;
+        let intrinsics = watched.lens.intrinsics;
         let estimate = fit_mount(
             &watched.people,
             &size,
@@ -429,7 +432,8 @@ impl PeopleArguments {
     /// Detections of the node's detector until the time is up, or the source ends.
     fn watch(&self, camera: &CameraConfig, lens: Lens) -> Result<Watched, Failure> {
         let mut detector = camera.detector.build().map_err(Failure::usage)?;
-        let (source, capture) = (camera.source.clone(), camera.capture.clone());
+        let source = camera.source.clone();
+        let capture = camera.capture.clone();
         let timeout = node::camera::open_timeout(camera);
         source.open(timeout).map(drop).map_err(Failure::usage)?;
         let runtime = tokio::runtime::Builder::new_current_thread()

@@ -349,10 +349,8 @@ mod tests {
     #[test]
     fn the_services_group_reads_the_nodes_certificate_and_key_and_not_the_cells_key() {
         let directory = tempfile::tempdir().unwrap();
-        let (cell, node) = (
-            NodeName::from_static("lot-1"),
-            NodeName::from_static("euclid"),
-        );
+        let cell = NodeName::from_static("lot-1");
+        let node = NodeName::from_static("euclid");
         let mut authority =
             Authority::init(&directory.path().join("pki"), &cell, clock::now()).unwrap();
         authority

@@ -99,7 +99,8 @@ impl<'a> LogReplay<'a> {
         if let Some(known) = &known
             && known.node != identity.node
         {
-            let (one, other) = (&known.node, &identity.node);
+            let one = &known.node;
+            let other = &identity.node;
             let what = format!(
                 "{} is of node {other}, earlier files are of {one}",
                 file.display()
@@ -108,7 +109,8 @@ impl<'a> LogReplay<'a> {
                 "{what}: give the files of one node at a time"
             )));
         }
-        let (file, version) = (file.display(), &identity.version);
+        let file = file.display();
+        let version = &identity.version;
         if version != env!("CARGO_PKG_VERSION")
             && known.as_ref().is_none_or(|known| known.version != *version)
         {

@@ -147,17 +147,14 @@ impl NodeBuilder {
             description,
             ..
         } = self.slots.clone();
-        let (name, live_state, leadership) = (
-            self.name.clone(),
-            Arc::clone(&self.live_state),
-            self.leadership(),
-        );
-        let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
-        let (report_queue, counters, door) = (
-            self.report_queue.clone(),
-            self.counters(),
-            self.door.clone(),
-        );
+        let name = self.name.clone();
+        let live_state = Arc::clone(&self.live_state);
+        let leadership = self.leadership();
+        let recording = self.recording.clone();
+        let fuses = self.config.may_lead();
+        let report_queue = self.report_queue.clone();
+        let counters = self.counters();
+        let door = self.door.clone();
         let recent_reports = Mutex::<RecentReports>::default();
         Arc::new(move |delivery| {
             let at = delivery.received_at;
@@ -187,7 +184,8 @@ impl NodeBuilder {
                     true
                 }
                 Incoming::Report { kind, report } => {
-                    let (kind, report) = (*kind, Arc::clone(report));
+                    let kind = *kind;
+                    let report = Arc::clone(report);
                     let node = report.node.clone();
                     let outcome =
                         report_queue.push(delivery.map(|_| QueuedReport { kind, report }));
@@ -328,11 +326,10 @@ impl NodeBuilder {
 
     /// A fuser starts with the keeper's evidence, and continues with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
-        let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let (now, ledger) = (
-            clock::now(),
-            Arc::new(self.reputations.open().ledger.clone()),
-        );
+        let fusion = self.config.fusion.clone();
+        let landmarks = self.config.landmarks();
+        let now = clock::now();
+        let ledger = Arc::new(self.reputations.open().ledger.clone());
         let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
         self.recording
@@ -365,7 +362,8 @@ impl NodeBuilder {
             uplink,
             ..
         } = self.slots.clone();
-        let (broker, door) = (self.cell_broker(), self.door.clone());
+        let broker = self.cell_broker();
+        let door = self.door.clone();
         LeaderElectionArguments {
             settings: NodeSettings {
                 election: ElectionConfig {
@@ -470,16 +468,18 @@ impl NodeBuilder {
         if !self.config.broker.door {
             return Door::default();
         }
-        let (leadership, members) = (self.leadership(), self.members());
+        let leadership = self.leadership();
+        let members = self.members();
         let credentials = self.security.credentials.clone();
-        let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
-        let (shared, to_project) = (self.shared.subscribe(), self.shared.subscribe());
-        let (may_lead, to_dismiss) = (self.config.may_lead(), self.live_state());
-        let (gateway, to_watch, live_state) = (
-            self.slots.gateway.clone(),
-            self.slots.gateway.clone(),
-            Arc::clone(&self.live_state),
-        );
+        let own_config = self.own_config.clone();
+        let description = self.slots.description.clone();
+        let shared = self.shared.subscribe();
+        let to_project = self.shared.subscribe();
+        let may_lead = self.config.may_lead();
+        let to_dismiss = self.live_state();
+        let gateway = self.slots.gateway.clone();
+        let to_watch = self.slots.gateway.clone();
+        let live_state = Arc::clone(&self.live_state);
         Door::new(DoorSetup {
             node: self.name.clone(),
             gateway_id: format!("{}-{}", self.name, self.run.simple()),
@@ -604,10 +604,8 @@ mod tests {
     use crate::transport::mqtt::Security;
 
     fn builder(config: NodeConfig) -> NodeBuilder {
-        let (vehicle, held) = (
-            (VehicleParts::new(&config), Presence::Whole),
-            HeldDescription::default(),
-        );
+        let vehicle = (VehicleParts::new(&config), Presence::Whole);
+        let held = HeldDescription::default();
         NodeBuilder::new(
             vehicle,
             config,
@@ -633,7 +631,8 @@ mod tests {
                 landmarks,
                 ..NodeConfig::default()
             };
-            (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
+            config.fusion.algorithms = algorithms;
+            config.fusion.tracks.mode = mode;
             let builder = builder(config);
             let keeps = builder
                 .parts()

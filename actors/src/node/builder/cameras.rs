@@ -41,7 +41,8 @@ impl NodeBuilder {
         let camera = self.camera(place)?;
         let source = camera.source.clone();
         let timeout = camera::open_timeout(camera);
-        let (record, log) = (self.config.record.as_ref(), self.vehicle.log.subscribe());
+        let record = self.config.record.as_ref();
+        let log = self.vehicle.log.subscribe();
         Ok(DetectorArguments {
             open: Arc::new(move || source.open(timeout)),
             capture: camera.capture.clone(),
@@ -68,7 +69,8 @@ impl NodeBuilder {
         if self.presence < Presence::Reporting {
             return;
         }
-        let (standing, origin) = (self.standing_pose(), self.config.origin);
+        let standing = self.standing_pose();
+        let origin = self.config.origin;
         for (camera, projector) in self.config.all_cameras().zip(&self.slots.projectors) {
             match camera::perception(&self.config, camera) {
                 Ok(perception) => {

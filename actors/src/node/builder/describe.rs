@@ -55,7 +55,8 @@ impl NodeBuilder {
 
     /// Sends the parts the settings that differ from `before`.
     fn configure_parts(&self, before: &NodeConfig) {
-        let (config, slots) = (&self.config, self.slots());
+        let config = &self.config;
+        let slots = self.slots();
         self.reputations.set_by_evidence(rates_by_evidence(config));
         if before.fusion.reputation != config.fusion.reputation {
             let reputation = config.fusion.reputation.clone();
@@ -64,7 +65,8 @@ impl NodeBuilder {
                 .send(ReputationKeeperMessage::Configure { reputation });
         }
         if (&before.fusion, &before.landmarks) != (&config.fusion, &config.landmarks) {
-            let (fusion, landmarks) = (Box::new(config.fusion.clone()), config.landmarks.clone());
+            let fusion = Box::new(config.fusion.clone());
+            let landmarks = config.landmarks.clone();
             slots
                 .fuser
                 .send(FuserMessage::Configure { fusion, landmarks });

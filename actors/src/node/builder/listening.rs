@@ -68,7 +68,8 @@ impl NodeBuilder {
     /// The broker with its connection gate. The gate is also used if only this machine can reach
     /// the broker, because silent connections would hold the node's file descriptors.
     fn embedded_broker(&self) -> EmbeddedBroker {
-        let (config, listen) = (self.config.broker(), self.config.broker_listen());
+        let config = self.config.broker();
+        let listen = self.config.broker_listen();
         let credentials = self.security.credentials.clone();
         match (&credentials, listen.ip().is_loopback()) {
             _ if !self.config.serves_nodes() => {
@@ -88,11 +89,10 @@ impl NodeBuilder {
                 tracing::info!(%listen, "broker for whoever has a certificate of the cell");
             }
         }
-        let (topics, elected) = (
-            Topics::new(&self.config.cell),
-            publish_rule(self.leadership()),
-        );
-        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
+        let topics = Topics::new(&self.config.cell);
+        let elected = publish_rule(self.leadership());
+        let limits = self.config.mqtt.limits();
+        let counters = self.counters();
         let policy = AccessPolicy {
             credentials,
             topics,

@@ -35,7 +35,8 @@ impl NodeBuilder {
 
     /// Sends the place and description of the cell to the uplink.
     pub(super) fn configure_uplink(&self) {
-        let (origin, description) = (self.config.origin, self.held.description.clone());
+        let origin = self.config.origin;
+        let description = self.held.description.clone();
         self.slots().uplink.send(UplinkMessage::Configure {
             origin,
             description,

@@ -188,17 +188,21 @@ impl NodeConfig {
             ..self.clone()
         };
         SharedConfig::default().put_into(&mut guest);
-        (guest.stated, guest.description) = (StatedKeys::default(), None);
+        guest.stated = StatedKeys::default();
+        guest.description = None;
         guest.mqtt.broker.clone_from(&cell.broker);
         // These settings are for the home cell's broker.
-        (guest.mqtt.user, guest.mqtt.password, guest.mqtt.ca) = (None, None, None);
+        guest.mqtt.user = None;
+        guest.mqtt.password = None;
+        guest.mqtt.ca = None;
         guest.membership.seeds.clone_from(&cell.seeds);
         guest.membership.advertise = None;
         if let Some(bind) = &mut guest.membership.bind {
             bind.set_port(0);
         }
         if let Some(file) = &cell.key_file {
-            (guest.membership.key, guest.membership.key_file) = (None, Some(file.clone()));
+            guest.membership.key = None;
+            guest.membership.key_file = Some(file.clone());
         }
         if let (Some(tls), Some(ca)) = (&mut guest.tls, &cell.ca) {
             tls.ca.clone_from(ca);

@@ -34,10 +34,14 @@ impl NodeConfig {
         }
         #[cfg(feature = "camera")]
         {
-            (self.camera, self.cameras) = (None, Vec::new());
+            self.camera = None;
+            self.cameras = Vec::new();
         }
-        (self.membership.advertise, self.state_dir, self.map_log) = (None, None, None);
-        (self.pose.listen, self.cells) = (None, None);
+        self.membership.advertise = None;
+        self.state_dir = None;
+        self.map_log = None;
+        self.pose.listen = None;
+        self.cells = None;
         self.dashboard.enabled = false;
         self.broker.door = false;
         self

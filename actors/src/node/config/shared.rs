@@ -234,7 +234,9 @@ impl SharedConfig {
                     projection: SharedProjection { sizes },
                 },
         } = self;
-        (config.fusion, config.landmarks, config.origin) = (fusion, landmarks, origin);
+        config.fusion = fusion;
+        config.landmarks = landmarks;
+        config.origin = origin;
         #[cfg(feature = "camera")]
         if config
             .all_cameras()

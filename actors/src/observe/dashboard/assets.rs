@@ -126,7 +126,8 @@ mod tests {
 
     #[test]
     fn a_report_gets_map_and_timeline_as_one_script() {
-        let (view, script) = (view(), view_script());
+        let view = view();
+        let script = view_script();
         for id in [
             "map",
             "map-table",

@@ -44,7 +44,8 @@ const JPEG_QUALITY: u8 = 75;
 impl PictureBox {
     /// A detection in an image of this size, without a place so far.
     pub fn new(detection: &Detection, image: ImageSize) -> Self {
-        let (width, height) = (f64::from(image.width), f64::from(image.height));
+        let width = f64::from(image.width);
+        let height = f64::from(image.height);
         let b = &detection.bounding_box;
         Self {
             label: detection.label.clone(),

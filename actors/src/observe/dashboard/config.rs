@@ -119,7 +119,8 @@ mod tests {
     use super::*;
 
     fn validate(listen: &str, token: Option<&str>) -> Result<(), ConfigError> {
-        let (listen, token) = (listen.parse().ok(), token.map(Secret::new));
+        let listen = listen.parse().ok();
+        let token = token.map(Secret::new);
         DashboardConfig {
             listen,
             token,

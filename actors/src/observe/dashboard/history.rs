@@ -109,12 +109,11 @@ impl History {
             .filter(|(at, _)| *at > time)
             .map(|(_, sample)| &**sample)
             .collect();
-        let (terms, samples, failovers) = (
-            json(&self.terms),
-            samples.join(&b','),
-            json(&self.failovers),
-        );
-        let (head, timeline) = (&b"{\"reigns\":"[..], self.timeline.json_since(time));
+        let terms = json(&self.terms);
+        let samples = samples.join(&b',');
+        let failovers = json(&self.failovers);
+        let head = &b"{\"reigns\":"[..];
+        let timeline = self.timeline.json_since(time);
         [
             head,
             &terms,
@@ -152,7 +151,8 @@ impl History {
             .as_ref()
             .filter(|(of, _)| of == epoch)
             .map(|(_, gap)| *gap);
-        let (leader, epoch) = (epoch.leader.clone(), epoch.term);
+        let leader = epoch.leader.clone();
+        let epoch = epoch.term;
         push(
             &mut self.terms,
             LeaderTerm {
@@ -270,10 +270,8 @@ mod tests {
                 gap_ms,
             }
         };
-        let (first, second) = (
-            term("edge", 3, 1, Some(10), None),
-            term("euclid", 4, 11, Some(16), Some(3000)),
-        );
+        let first = term("edge", 3, 1, Some(10), None);
+        let second = term("euclid", 4, 11, Some(16), Some(3000));
         assert_eq!(
             history.terms,
             [first, second, term("gauss", 5, 16, None, Some(1000))]

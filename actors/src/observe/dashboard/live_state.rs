@@ -455,7 +455,8 @@ mod tests {
             };
             live_state.update(&message, Timestamp(2));
         };
-        let (edge, standby) = ("10.0.0.2:1883", "10.0.0.3:1883");
+        let edge = "10.0.0.2:1883";
+        let standby = "10.0.0.3:1883";
         say(NodeState::Following, edge);
         withdraw(edge);
         assert_eq!(live_state.statuses().len(), 1, "it goes on elsewhere");
@@ -533,7 +534,8 @@ mod tests {
             lies.map(|(kind, about)| trouble(kind, about, "by aaa"))
                 .into(),
         );
-        let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
+        let name = NodeName::from_static("self");
+        let edge = NodeName::from_static("edge");
         let told = live_state.troubles(&name, Some(&edge), own);
         let told: Vec<_> = told
             .iter()
@@ -604,7 +606,8 @@ mod tests {
                 ..of_leader
             }],
         );
-        let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
+        let name = NodeName::from_static("self");
+        let edge = NodeName::from_static("edge");
         let shown = live_state.troubles(&name, Some(&edge), Vec::new());
         let causes_by = |by: &str| -> Vec<&str> {
             let of_node = shown.iter().filter(|(author, _)| {
@@ -652,11 +655,13 @@ mod tests {
             live_state.update(&report(honest, 1), Timestamp(1));
         }
         for part in 0..4 * MAX_SHOWN as u64 {
-            let (name, at) = (format!("gauss--{part}"), Timestamp(2 + part));
+            let name = format!("gauss--{part}");
+            let at = Timestamp(2 + part);
             live_state.update(&status(&name, NodeState::Following), at);
             live_state.update(&report(&name, 1), at);
         }
-        let (statuses, end) = (live_state.statuses(), Timestamp(2 + 4 * MAX_SHOWN as u64));
+        let statuses = live_state.statuses();
+        let end = Timestamp(2 + 4 * MAX_SHOWN as u64);
         live_state.update(&report("late", 1), end);
         let reports = live_state.reports_since(Timestamp(0));
         let reported: BTreeSet<_> = reports

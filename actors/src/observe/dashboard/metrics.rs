@@ -55,7 +55,8 @@ pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
 }
 
 fn node(registry: &mut Registry, monitor: &NodeMonitor) {
-    let (sources, probe) = (&monitor.sources, monitor.observed().probe.clone());
+    let sources = &monitor.sources;
+    let probe = monitor.observed().probe.clone();
     let facts = &sources.node;
     let labels = vec![
         ("node", facts.name.to_string()),
@@ -119,10 +120,8 @@ fn missing(registry: &mut Registry, monitor: &NodeMonitor) {
     let help =
         "Time since an expected node that does not answer last did; the first nodes by name only";
     registry.register_with_unit("member_missing", help, Unit::Seconds, absences.clone());
-    let (now, nodes) = (
-        clock::now(),
-        monitor.sources.live_state.expected().missing(),
-    );
+    let now = clock::now();
+    let nodes = monitor.sources.live_state.expected().missing();
     for MissingNode {
         name, last_seen, ..
     } in nodes.into_iter().take(MAX_VEHICLES)
@@ -215,7 +214,8 @@ fn election(registry: &mut Registry, monitor: &NodeMonitor) {
 }
 
 fn rounds(registry: &mut Registry, monitor: &NodeMonitor) {
-    let (newest, latency) = (&monitor.sources.vitals.newest, &monitor.map_latency);
+    let newest = &monitor.sources.vitals.newest;
+    let latency = &monitor.map_latency;
     for (name, help, histogram) in [
         (
             "map_capture_to_fused",

@@ -111,12 +111,12 @@ impl NodeMonitor {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let (sources, now, readiness) = (&self.sources, clock::now(), self.readiness());
+        let sources = &self.sources;
+        let now = clock::now();
+        let readiness = self.readiness();
         let newest = &sources.vitals.newest;
-        let (leadership, map) = (
-            sources.vitals.leadership.borrow().clone(),
-            newest.map.borrow().clone(),
-        );
+        let leadership = sources.vitals.leadership.borrow().clone();
+        let map = newest.map.borrow().clone();
         let observed = self.observed();
         let Observed { history, probe } = &*observed;
         let since = history
@@ -180,8 +180,11 @@ impl NodeMonitor {
         let mut maps = self.sources.vitals.newest.map.subscribe();
         let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
         let mut members = self.sources.members.clone();
-        let (mut samples, mut looks) = (ticks(SAMPLE_PERIOD), ticks(LOOK_PERIOD));
-        let (mut next_snapshot, mut changed, mut sent_at) = (Instant::now(), true, Instant::now());
+        let mut samples = ticks(SAMPLE_PERIOD);
+        let mut looks = ticks(LOOK_PERIOD);
+        let mut next_snapshot = Instant::now();
+        let mut changed = true;
+        let mut sent_at = Instant::now();
         self.take_leadership();
         loop {
             let due = if changed {
@@ -209,7 +212,9 @@ impl NodeMonitor {
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
                     let event = self.cached_event();
                     self.snapshots.send_replace(event.value);
-                    (next_snapshot, sent_at, changed) = (event.expires_at, Instant::now(), false);
+                    next_snapshot = event.expires_at;
+                    sent_at = Instant::now();
+                    changed = false;
                 }
             }
         }
@@ -282,7 +287,9 @@ impl NodeMonitor {
 
     /// Adds new events and the newest map to the timeline.
     fn extend_timeline(&self) {
-        let (sources, now, troubles) = (&self.sources, clock::now(), self.troubles());
+        let sources = &self.sources;
+        let now = clock::now();
+        let troubles = self.troubles();
         let newest = &sources.vitals.newest;
         let map = newest.map.borrow().clone();
         let map = map.map(|newest| Received {

@@ -123,7 +123,8 @@ impl HttpApi {
 
     /// The camera of `?name=`, or the first; else an answer with the names.
     fn camera(&self, uri: &Uri) -> Result<&ShownCamera, (StatusCode, String)> {
-        let (sources, name) = (&self.monitor.sources, value_in(uri, "name="));
+        let sources = &self.monitor.sources;
+        let name = value_in(uri, "name=");
         sources.camera(name).ok_or_else(|| {
             let names: Vec<_> = sources
                 .cameras
@@ -170,7 +171,8 @@ struct MissingAnswer {
 }
 
 async fn show_readiness(State(api): Api) -> Response {
-    let (readiness, now) = (api.monitor.readiness(), clock::now());
+    let readiness = api.monitor.readiness();
+    let now = clock::now();
     let missing = api.monitor.sources.live_state.expected().missing();
     let missing = missing.into_iter().map(|node| MissingAnswer {
         missing_s: now.since(node.last_seen).as_secs(),

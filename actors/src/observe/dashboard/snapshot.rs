@@ -211,7 +211,8 @@ fn others(
             nodes.len() - 1
         });
         if let Some(node) = nodes.get_mut(at) {
-            (node.missing, node.last_seen_us) = (true, Some(last_seen));
+            node.missing = true;
+            node.last_seen_us = Some(last_seen);
         }
     }
     nodes
@@ -241,10 +242,8 @@ mod tests {
     #[test]
     fn who_no_longer_answers_or_is_only_known_from_a_lost_broker_is_gone() {
         let name = NodeName::from_static;
-        let (edge, euclid): (BrokerAddress, BrokerAddress) = (
-            "10.0.0.2:1883".parse().unwrap(),
-            "10.0.0.3:1883".parse().unwrap(),
-        );
+        let edge: BrokerAddress = "10.0.0.2:1883".parse().unwrap();
+        let euclid: BrokerAddress = "10.0.0.3:1883".parse().unwrap();
         let member = Member {
             name: name("euclid"),
             run: 0,

@@ -76,7 +76,8 @@ impl EntryEncoder {
         LogEntry { at, item }: &LogEntry,
         sink: &mut impl MessageSink,
     ) -> McapResult<()> {
-        let (at, node) = (*at, self.node.clone());
+        let at = *at;
+        let node = self.node.clone();
         let mut output = Output {
             encoder: self,
             at,
@@ -84,7 +85,8 @@ impl EntryEncoder {
         };
         match item {
             LogItem::Report(kind, report) => {
-                let (vehicle, captured_at) = (&report.node, report.captured_at_us);
+                let vehicle = &report.node;
+                let captured_at = report.captured_at_us;
                 output.put(
                     SchemaName::ObjectReport,
                     kind.topic(vehicle.clone()),
@@ -309,7 +311,8 @@ impl<S: MessageSink> Output<'_, S> {
     }
 
     fn log(&mut self, level: Level, message: impl FnOnce() -> String) -> McapResult<()> {
-        let (timestamp, name) = (self.at.into(), self.encoder.node.to_string());
+        let timestamp = self.at.into();
+        let name = self.encoder.node.to_string();
         let log = |_: &SceneStyle| Log {
             timestamp,
             level,

@@ -128,7 +128,8 @@ impl FrameTransform {
             position: translation,
             orientation: rotation,
         } = camera_pose(&pose);
-        let (parent_frame_id, child_frame_id) = (MAP.to_owned(), node.to_string());
+        let parent_frame_id = MAP.to_owned();
+        let child_frame_id = node.to_string();
         Self {
             timestamp: at.into(),
             parent_frame_id,
@@ -146,7 +147,8 @@ impl FrameTransform {
             z: -0.5,
             w: 0.5,
         };
-        let (parent_frame_id, child_frame_id) = (reporter.to_string(), optical_frame(reporter));
+        let parent_frame_id = reporter.to_string();
+        let child_frame_id = optical_frame(reporter);
         Self {
             timestamp: at.into(),
             parent_frame_id,
@@ -164,7 +166,8 @@ fn plane_pose(x_m: f64, y_m: f64, heading_rad: f64) -> FoxglovePose {
 
 /// Pose of a camera; without stated height and tilt, it is on the ground and level.
 fn camera_pose(pose: &WirePose) -> FoxglovePose {
-    let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
+    let roll_rad = pose.roll_rad.unwrap_or(0.0);
+    let pitch_rad = pose.pitch_rad.unwrap_or(0.0);
     let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, pose.heading_rad);
     FoxglovePose {
         position: Vector3 {

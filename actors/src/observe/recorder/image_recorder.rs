@@ -43,7 +43,8 @@ impl ImageRecorder {
         let hz = config
             .map(|record| record.camera_hz)
             .filter(|hz| *hz > 0.0)?;
-        let (camera, reporter) = (camera.name.clone(), camera.reporter(vehicle));
+        let reporter = camera.reporter(vehicle);
+        let camera = camera.name.clone();
         Some(Self {
             log,
             clock,
@@ -106,7 +107,8 @@ mod tests {
         let (sender, recorded) = mpsc::sync_channel(64);
         let log = LogSender::default();
         log.connect(Some(sender));
-        let (log, reporter) = (watch::channel(log).1, NodeName::from_static("euclid"));
+        let log = watch::channel(log).1;
+        let reporter = NodeName::from_static("euclid");
         (
             ImageRecorder {
                 log,

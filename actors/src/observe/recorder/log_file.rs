@@ -154,7 +154,8 @@ mod tests {
             Vec::new(),
         );
         let json = br#"{"at_us":0,"event":{"missing":{"entries":1}}}"#;
-        let (at, made_at) = (Timestamp(0), Timestamp(0));
+        let at = Timestamp(0);
+        let made_at = Timestamp(0);
         let message = EncodedMessage {
             schema: SchemaName::JournalEntry,
             topic: "node/journal",

@@ -234,7 +234,8 @@ impl LogReader {
                     *self.unknown.entry(channel.schema_name.clone()).or_default() += 1;
                     return None;
                 };
-                let (topic, at) = (channel.topic.clone(), Timestamp(header.log_time / 1000));
+                let topic = channel.topic.clone();
+                let at = Timestamp(header.log_time / 1000);
                 Some(Ok(LogEvent::Message(LogMessage {
                     schema,
                     topic,

@@ -143,7 +143,8 @@ impl LogWriter {
     }
 
     fn begin(&mut self, entry: &LogEntry) -> McapResult<LogFile> {
-        let (dir, node) = (&self.config.dir, &self.identity.node);
+        let dir = &self.config.dir;
+        let node = &self.identity.node;
         std::fs::create_dir_all(dir)?;
         // Deletion comes first, since it may free the space that is needed. Its failure does not
         // end the log.
@@ -181,12 +182,12 @@ impl LogWriter {
             LogItem::Journal(JournalEvent::Command(Command::Lead {
                 epoch, first_round, ..
             })) => {
-                (aggregator_state.leads, aggregator_state.next_round) =
-                    (Some(epoch.clone()), *first_round);
+                aggregator_state.leads = Some(epoch.clone());
+                aggregator_state.next_round = *first_round;
             }
             LogItem::Journal(JournalEvent::Command(Command::Configure { fusion, landmarks })) => {
-                (self.identity.fusion, self.identity.landmarks) =
-                    (FusionConfig::clone(fusion), landmarks.clone());
+                self.identity.fusion = FusionConfig::clone(fusion);
+                self.identity.landmarks = landmarks.clone();
             }
             LogItem::Journal(JournalEvent::Command(Command::StepDown)) => {
                 aggregator_state.leads = None;
@@ -357,7 +358,8 @@ mod tests {
 
     #[test]
     fn a_file_that_begins_after_a_change_of_settings_has_those_of_then() {
-        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let directory = tempfile::tempdir().unwrap();
+        let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
         let landmarks = vec![LandmarkConfig::at("slot-0", 1.0, 2.0)];
         let change = Command::Configure {
@@ -385,7 +387,8 @@ mod tests {
 
     #[test]
     fn a_change_of_settings_that_finds_the_queue_full_is_written_at_its_place() {
-        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let directory = tempfile::tempdir().unwrap();
+        let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
         let (sender, queue) = sync_channel(1);
         writer.recording.connect(Some(sender));
@@ -451,7 +454,8 @@ mod tests {
 
     #[test]
     fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
-        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let directory = tempfile::tempdir().unwrap();
+        let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
         let entry = |seconds: u64| second(seconds, LogItem::Counters(counters.snapshot()));
         writer.write(&entry(1));
@@ -481,7 +485,8 @@ mod tests {
 
     #[test]
     fn what_a_disk_did_not_take_is_counted_as_dropped_and_told_of_in_the_next_file() {
-        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let directory = tempfile::tempdir().unwrap();
+        let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
         let counts = || [Event::Recorded, Event::RecordDropped].map(|event| counters.events(event));
         let flags = MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING;
@@ -519,7 +524,8 @@ mod tests {
     /// The number of a round is for files that start later; it does not cause a new file.
     #[test]
     fn files_and_gaps_bear_the_time_of_what_is_written() {
-        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let directory = tempfile::tempdir().unwrap();
+        let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
         let (sender, queue) = sync_channel(1);
         writer.recording.connect(Some(sender));

@@ -107,10 +107,8 @@ mod tests {
 
     #[test]
     fn losses_of_all_runs_add_up() {
-        let (mut losses, runs) = (
-            Losses::default(),
-            [1, 2].map(|number| Some(Uuid::from_u128(number))),
-        );
+        let mut losses = Losses::default();
+        let runs = [1, 2].map(|number| Some(Uuid::from_u128(number)));
         assert!(!losses.are_known());
         let readings = [
             (runs[0], 3, 7),

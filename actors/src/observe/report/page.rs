@@ -104,7 +104,8 @@ fn leadership(report: &Report) -> String {
         .iter()
         .map(|run| {
             let lasted = format!("{:.1}", run.last_at.since(run.first_at).as_secs_f64());
-            let (leader, term) = (run.epoch.leader.to_string(), run.epoch.term.to_string());
+            let leader = run.epoch.leader.to_string();
+            let term = run.epoch.term.to_string();
             vec![
                 leader,
                 term,

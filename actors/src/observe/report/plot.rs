@@ -178,7 +178,8 @@ impl Scale {
 /// Horizontal bars of shares in percent.
 pub fn bars(title: &str, shares: &[(String, f64)]) -> String {
     let height = BAR * shares.len() as f64 + 8.0;
-    let (left, width) = (160.0, WIDTH - 160.0 - 60.0);
+    let left = 160.0;
+    let width = WIDTH - 160.0 - 60.0;
     let mut picture = picture(title, height);
     for (index, (name, share)) in shares.iter().enumerate() {
         let y = 4.0 + BAR * index as f64;

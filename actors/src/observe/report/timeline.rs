@@ -229,10 +229,8 @@ impl LogTimeline {
         let data = fields.map(|field| field.concat()).concat();
         // Names in the log must not end the element.
         let data = String::from_utf8_lossy(&data).replace('<', "\\u003c");
-        let (view, script) = (
-            assets::view(),
-            assets::view_script() + include_str!("report.js"),
-        );
+        let view = assets::view();
+        let script = assets::view_script() + include_str!("report.js");
         format!(
             "<section class=\"map-card\">\n{view}<figure id=\"picture-frame\" hidden><img id=\"picture\" alt=\"Image of the camera\">\
              <figcaption id=\"picture-at\"></figcaption></figure>\n\

@@ -112,7 +112,8 @@ impl BacklogSlot {
         };
         let before = holding.bytes();
         change(holding);
-        let (bytes, principal) = (holding.bytes(), holding.principal.clone());
+        let bytes = holding.bytes();
+        let principal = holding.principal.clone();
         holding.since = holding.since.or(Some(now)).filter(|_| bytes > 0);
         table.bytes = (table.bytes + bytes).saturating_sub(before);
         let Backlog {

@@ -56,8 +56,10 @@ mod tests {
 
     /// Bytes sent in a time by two connections that wait as required.
     fn sent(large: bool, packet: usize, seconds: u64) -> usize {
-        let (throttle, principal) = (ByteThrottle::default(), "gauss".into());
-        let (mut waits, mut sent) = ([Timestamp(0); 2], 0);
+        let throttle = ByteThrottle::default();
+        let principal = "gauss".into();
+        let mut waits = [Timestamp(0); 2];
+        let mut sent = 0;
         loop {
             waits.sort();
             let [now, _] = waits;
@@ -74,10 +76,8 @@ mod tests {
     #[test]
     fn connections_of_one_principal_share_a_rate() {
         let mib = |bytes: usize| bytes as f64 / f64::from(1 << 20);
-        let (long, short) = (
-            mib(sent(false, 64 * 1024, 20)),
-            mib(sent(false, 64 * 1024, 10)),
-        );
+        let long = mib(sent(false, 64 * 1024, 20));
+        let short = mib(sent(false, 64 * 1024, 10));
         assert!(
             (38.0..42.0).contains(&(long - short)),
             "4 MiB a second: {long} {short}"

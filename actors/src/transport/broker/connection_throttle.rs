@@ -171,10 +171,8 @@ impl AddressTable {
 
     /// Raises the rate of an address from which a client is, or was until now, logged in.
     fn note_login(&mut self, source: IpAddr, now: Timestamp) {
-        let (burst, interval) = (
-            self.burst.saturating_mul(PRIVILEGED_FACTOR),
-            self.interval / PRIVILEGED_FACTOR,
-        );
+        let burst = self.burst.saturating_mul(PRIVILEGED_FACTOR);
+        let interval = self.interval / PRIVILEGED_FACTOR;
         let Some(entry) = self.entry(source, now) else {
             return;
         };

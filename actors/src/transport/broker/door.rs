@@ -243,7 +243,8 @@ impl Door {
                                  retain,
                              }| {
             let topic = place.topic(&topic).into();
-            let (qos, properties) = (QoS::AtMostOnce, None);
+            let qos = QoS::AtMostOnce;
+            let properties = None;
             let packet = CodecPublish {
                 dup: false,
                 retain,

@@ -264,7 +264,8 @@ impl MqttBroker for EmbeddedBroker {
         let (ready, started) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
         let heartbeat = ThreadHeartbeat::default();
-        let (config, policy) = (self.config.clone(), self.policy.clone());
+        let config = self.config.clone();
+        let policy = self.policy.clone();
         let callbacks = Callbacks {
             door: self.door.clone(),
             expelled: Arc::clone(&self.expelled),

@@ -156,10 +156,8 @@ impl BrokerFrontend {
             self.shared.counters.count(Event::ClientThrottled);
             return;
         };
-        let (shared, current) = (
-            Arc::clone(&self.shared),
-            self.current.as_ref().map(watch::Sender::subscribe),
-        );
+        let shared = Arc::clone(&self.shared);
+        let current = self.current.as_ref().map(watch::Sender::subscribe);
         tokio::spawn(async move {
             if let Err(turned_away) = shared.serve(stream, from, current, slot).await {
                 turned_away

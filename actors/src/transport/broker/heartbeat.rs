@@ -32,9 +32,12 @@ impl ThreadHeartbeat {
     pub(super) fn has_stopped(&mut self, now: Timestamp) -> bool {
         let beats = self.beats.load(Ordering::Relaxed);
         if beats != self.seen {
-            (self.seen, self.checked_at, self.missed) = (beats, now, 0);
+            self.seen = beats;
+            self.checked_at = now;
+            self.missed = 0;
         } else if now.since(self.checked_at) >= HEARTBEAT_INTERVAL {
-            (self.checked_at, self.missed) = (now, self.missed + 1);
+            self.checked_at = now;
+            self.missed += 1;
         }
         self.missed >= MAX_MISSED_CHECKS
     }

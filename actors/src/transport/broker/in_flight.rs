@@ -137,11 +137,9 @@ mod tests {
 
     #[test]
     fn a_payload_counts_until_its_last_copy_is_gone() {
-        let (in_flight, gauss, euclid) = (
-            InFlight::default(),
-            Arc::<str>::from("gauss"),
-            Arc::<str>::from("euclid"),
-        );
+        let in_flight = InFlight::default();
+        let gauss = Arc::<str>::from("gauss");
+        let euclid = Arc::<str>::from("euclid");
         let held: Vec<_> = (0..3)
             .map(|_| {
                 in_flight.charge(

@@ -62,7 +62,9 @@ mod tests {
         let long = [&[0x30, 0xc8, 0x01][..], &[7; 200]].concat();
         let stream = [&[0xd0, 0][..], &long, &[0x40, 2, 0, 1]].concat();
         for size in 1..=stream.len() {
-            let (mut scanner, mut heads, mut bodies) = (PacketScanner::default(), Vec::new(), 0);
+            let mut scanner = PacketScanner::default();
+            let mut heads = Vec::new();
+            let mut bodies = 0;
             for mut chunk in stream.chunks(size) {
                 while let Some(piece) = scanner.next(&mut chunk) {
                     match piece {

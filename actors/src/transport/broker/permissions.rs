@@ -109,7 +109,8 @@ impl Permissions {
             .principals
             .principal(session.id.remote_addr)
             .ok_or_else(refused)?;
-        let (retain, bytes) = (publish.retain, publish.payload.len());
+        let retain = publish.retain;
+        let bytes = publish.payload.len();
         if self.door.is_program(&principal, &session.id.client_id) {
             self.check_limits(topic, retain, bytes)
                 .map_err(DoorRefusal::not_permitted)?;
@@ -147,7 +148,8 @@ impl Permissions {
     /// The limit that a message exceeds, if any.
     fn check_limits(&self, topic: &str, retain: bool, bytes: usize) -> Result<(), String> {
         if !is_topic_bounded(topic) {
-            let (length, levels) = (topic.len(), topic.split('/').count());
+            let length = topic.len();
+            let levels = topic.split('/').count();
             let most = format!("at most {MAX_TOPIC_BYTES} and {MAX_TOPIC_LEVELS}");
             return Err(format!(
                 "the topic has {length} bytes and {levels} levels, {most}"
@@ -168,7 +170,8 @@ impl Permissions {
     }
 
     fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
-        let (client, topic) = (&session.id.client_id, TopicPlace::of(&publish.topic).1);
+        let client = &session.id.client_id;
+        let topic = TopicPlace::of(&publish.topic).1;
         let principal = self.principals.principal(session.id.remote_addr);
         if principal
             .as_ref()
@@ -330,7 +333,8 @@ mod tests {
     use crate::transport::pki::Authority;
 
     fn identity(name: &'static str, role: Role) -> CertificateSubject {
-        let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static(name));
+        let directory = tempfile::tempdir().unwrap();
+        let name = NodeName::from_static(name);
         let mut authority = Authority::init(
             directory.path(),
             &NodeName::from_static("lot"),
@@ -377,7 +381,8 @@ mod tests {
         let allows = |identity: &CertificateSubject, topic: &str| {
             permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
         };
-        let (edge, euclid) = (identity("edge", Role::Edge), identity("euclid", Role::Auto));
+        let edge = identity("edge", Role::Edge);
+        let euclid = identity("euclid", Role::Auto);
         for topic in [
             "detections/euclid",
             "vote_detections/euclid",

@@ -58,7 +58,8 @@ impl Principal {
     /// The programs of this party, whose connections, messages and bytes count separately.
     pub(super) fn programs(self) -> Self {
         let apart = |key: &Arc<str>| Arc::from(format!("{key}, programs"));
-        let (quota_key, source) = (self.quota_key.as_ref().map(apart), apart(&self.source));
+        let quota_key = self.quota_key.as_ref().map(apart);
+        let source = apart(&self.source);
         Self {
             quota_key,
             source,
@@ -310,7 +311,8 @@ mod tests {
     #[test]
     fn programs_use_up_nothing_of_their_node() {
         let quota = ConnectionQuota::new(1);
-        let (node, programs) = (at("10.0.0.1"), at("10.0.0.1").programs());
+        let node = at("10.0.0.1");
+        let programs = at("10.0.0.1").programs();
         let held = quota.take(&programs);
         assert!(held.is_some() && quota.take(&programs).is_none());
         assert!(quota.take(&node).is_some());

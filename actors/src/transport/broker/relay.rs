@@ -141,9 +141,11 @@ impl RelayLimits {
             slot,
             activity,
         } = client;
-        let (mut buffer, mut scanner, mut unfinished) =
-            (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
-        let (mut content, mut charged) = (0, 0);
+        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut scanner = PacketScanner::default();
+        let mut unfinished = 0;
+        let mut content = 0;
+        let mut charged = 0;
         loop {
             let read = from_client.read(&mut buffer).await?;
             store(&activity.received_us, clock::now());
@@ -151,7 +153,8 @@ impl RelayLimits {
             if received.is_empty() {
                 return Ok(());
             }
-            let (mut pieces, mut packets) = (received, 0);
+            let mut pieces = received;
+            let mut packets = 0;
             while let Some(piece) = scanner.next(&mut pieces) {
                 match piece {
                     Piece::Head(header, length) if has_too_many_filters(&header, length) => {
@@ -204,8 +207,10 @@ impl RelayLimits {
             slot,
             activity,
         } = client;
-        let (mut buffer, mut queue) = (vec![0; BUFFER_BYTES], OutboundQueue::new(self.max_waiting));
-        let (mut is_flushed, mut has_ended) = (true, false);
+        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut queue = OutboundQueue::new(self.max_waiting);
+        let mut is_flushed = true;
+        let mut has_ended = false;
         tokio::pin!(cut);
         loop {
             if has_ended && queue.is_empty() && is_flushed {

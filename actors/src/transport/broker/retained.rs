@@ -59,7 +59,8 @@ impl RetainStorage for RetainedMessages {
         let expiry = properties
             .and_then(|p| p.message_expiry_interval)
             .map(|s| Duration::from_secs(s.get().into()));
-        let (now, bytes) = (Instant::now(), message.publish.payload.len());
+        let now = Instant::now();
+        let bytes = message.publish.payload.len();
         let mut index = self.index.lock().await;
         let has_room = is_topic_bounded(topic)
             && (bytes == 0 || index.insert(topic, bytes, expiry.map(|expiry| now + expiry), now));
@@ -197,7 +198,8 @@ mod tests {
     #[test]
     fn what_has_expired_makes_room() {
         let mut index = index(1, 100);
-        let (now, second) = (Instant::now(), Duration::from_secs(1));
+        let now = Instant::now();
+        let second = Duration::from_secs(1);
         assert!(
             index.insert("a", 100, Some(now + second), now) && !index.insert("b", 1, None, now)
         );

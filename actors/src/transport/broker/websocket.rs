@@ -332,10 +332,8 @@ mod tests {
             .nodename()
             .to_string_lossy()
             .to_ascii_lowercase();
-        let (own, own_local) = (
-            format!("http://{own}:8000"),
-            format!("http://{own}.local:8000"),
-        );
+        let own_local = format!("http://{own}.local:8000");
+        let own = format!("http://{own}:8000");
         for (origin, host) in [
             (&*own, own.trim_start_matches("http://")),
             (&*own_local, own_local.trim_start_matches("http://")),

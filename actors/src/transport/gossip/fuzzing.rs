@@ -278,11 +278,10 @@ impl Listener {
         match message {
             Handshake::Challenge { cookie, .. } => self.challenge = Some(cookie),
             Handshake::Proof { cookie, .. } if self.prover.is_some() => {
-                let (attestation, head) = (
-                    decode::<Attestation>(rest).ok()?,
-                    head.bytes(self.key.tag()),
-                );
-                let (side, message) = (Side::Prover, body.get(..body.len() - rest.len())?);
+                let attestation = decode::<Attestation>(rest).ok()?;
+                let head = head.bytes(self.key.tag());
+                let side = Side::Prover;
+                let message = body.get(..body.len() - rest.len())?;
                 let signed = SignedMessage {
                     side,
                     head,

@@ -177,7 +177,8 @@ impl Prover {
         signed: &SignedMessage<'_>,
         ephemeral: [u8; 32],
     ) -> Option<(Attestation, Transcript)> {
-        let (nonce, certificate) = (self.nonce, self.certificate().to_vec());
+        let nonce = self.nonce;
+        let certificate = self.certificate().to_vec();
         let mut attestation = Attestation {
             ephemeral,
             nonce,

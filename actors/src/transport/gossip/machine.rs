@@ -520,7 +520,8 @@ impl GossipMachine {
             self.outputs.extend(silent.map(|seed| {
                 let cause =
                     "this seed does not answer: it does not run, its cell or key is another, or UDP does not pass";
-                let (about, kind) = (seed.to_string(), TroubleKind::SeedSilent);
+                let about = seed.to_string();
+                let kind = TroubleKind::SeedSilent;
                 GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause: cause.into() })
             }));
         }
@@ -547,7 +548,8 @@ impl GossipMachine {
             at.since(taken.since) >= TAKEN_TIME && at.since(taken.reported) >= REPORT_INTERVAL;
         if is_due {
             taken.reported = at;
-            let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
+            let about = name.to_string();
+            let kind = TroubleKind::NameTaken;
             self.outputs
                 .push_back(GossipOutput::Tell(MembershipEvent::Troubled {
                     about,

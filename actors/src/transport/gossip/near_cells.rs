@@ -94,7 +94,8 @@ mod tests {
 
     #[test]
     fn invented_tags_are_not_searched_for_ever() {
-        let (mut cells, own) = (NearCells::default(), NodeName::from_static("lot"));
+        let mut cells = NearCells::default();
+        let own = NodeName::from_static("lot");
         assert!(
             (0..2 * MAX_TAGS as u32).all(|tag| cells.name_of(tag.to_be_bytes(), &own).is_none())
         );

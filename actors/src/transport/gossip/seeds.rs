@@ -86,10 +86,8 @@ mod tests {
     async fn a_seed_of_the_wrong_family_or_without_an_address_is_tried_on() {
         let seeds = ["127.0.0.1:9", "[::1]:9", "no port"].map(str::to_owned);
         let mut unresolved = BTreeSet::from(["127.0.0.1:9".to_owned()]);
-        let (usual, before): (SocketAddr, SocketAddr) = (
-            "127.0.0.1:9".parse().unwrap(),
-            "192.0.2.1:9".parse().unwrap(),
-        );
+        let usual: SocketAddr = "127.0.0.1:9".parse().unwrap();
+        let before: SocketAddr = "192.0.2.1:9".parse().unwrap();
         let mut known = BTreeMap::from([("no port".to_owned(), vec![before])]);
         let failed = std::cell::RefCell::new(Vec::new());
         let trouble = |seed: &str, _: &io::Error| failed.borrow_mut().push(seed.to_owned());

@@ -167,7 +167,8 @@ impl Swim {
             .get(..body.len() - updates.len())
             .unwrap_or_default()
             .to_vec();
-        let (mut codec, mut kept_updates) = (PostcardCodec, Vec::new());
+        let mut codec = PostcardCodec;
+        let mut kept_updates = Vec::new();
         for _ in 0..u16::from_be_bytes(*count) {
             let update: foca::Member<NodeId> = codec.decode_member(&mut rest)?;
             let id = update.id();

@@ -68,7 +68,8 @@ impl TrialAuthority {
     /// Paths of a node's files.
     pub(crate) fn files(&self, name: &NodeName) -> TlsConfig {
         let (certificate, key) = self.authority.files_of(name);
-        let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
+        let ca = self.authority.ca();
+        let list = self.authority.revocation_list();
         TlsConfig {
             ca,
             certificate,

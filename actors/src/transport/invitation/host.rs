@@ -162,7 +162,8 @@ impl Host {
             tokio::select! {
                 accepted = listener.accept(), if visits.len() < MAX_VISITS => match accepted {
                     Ok((stream, from)) => {
-                        let (tls, ask) = (self.tls.clone(), ask.clone());
+                        let tls = self.tls.clone();
+                        let ask = ask.clone();
                         visits.spawn(async move {
                             let visit = timeout(CONVERSATION_TIME, receive(tls, stream, ask)).await;
                             let failed = |reason: String| (from, reason);
@@ -231,7 +232,8 @@ impl Host {
             guest.ok_or("the token was used already, or is of another `ecod-node invite`")?;
         let signing = CertificateSigningRequestParams::from_pem(&request.request)
             .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
-        let (node, now) = (&request.node, clock::now());
+        let node = &request.node;
+        let now = clock::now();
         if let Some(serial) = &guest.issued {
             self.authority
                 .revoke_serial(serial, now)

@@ -95,7 +95,8 @@ impl Link {
         report: LinkSink,
     ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
-        let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
+        let hearing = Arc::<Hearing>::default();
+        let at = broker.clone();
         let task = LinkTask {
             id,
             broker: at,
@@ -108,7 +109,8 @@ impl Link {
         };
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
-        let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
+        let abort = task.abort_handle();
+        let echo = EchoMonitor::default();
         Self {
             broker,
             state: LinkState::Down,
@@ -359,7 +361,8 @@ impl LinkTask {
             && error.rejection().is_none()
             && !matches!(error, ConnectionError::Oversized(_))
         {
-            let (broker, troubles) = (self.broker.to_string(), self.setup.counters.troubles());
+            let broker = self.broker.to_string();
+            let troubles = self.setup.counters.troubles();
             troubles.note_about(
                 &broker,
                 self.setup.unreachable,

@@ -144,11 +144,9 @@ impl Security {
     /// the remedy. Such connections are retried, and succeed once the clock is set.
     pub fn clock_fault(&self) -> Option<String> {
         let credentials = self.credentials.as_ref()?.current();
-        let (wall, begins, expires) = (
-            clock::wall(),
-            credentials.identity.begins(),
-            credentials.identity.expires(),
-        );
+        let wall = clock::wall();
+        let begins = credentials.identity.begins();
+        let expires = credentials.identity.expires();
         let date = |time: Timestamp| {
             let date = i64::try_from(time.micros())
                 .ok()
@@ -159,7 +157,9 @@ impl Security {
             )
         };
         (wall < begins || wall > expires).then(|| {
-            let (wall, begins, expires) = (date(wall), date(begins), date(expires));
+            let wall = date(wall);
+            let begins = date(begins);
+            let expires = date(expires);
             format!(
                 "this machine's clock says {wall}, and the node's certificate is valid from {begins} to {expires}: set the \
                  clock, such as by `timedatectl set-ntp true`, or give it a new certificate by `ecod-node pki issue`"
@@ -294,7 +294,8 @@ mod tests {
 
     #[test]
     fn a_clock_before_or_after_the_certificate_is_told_with_its_remedy() {
-        let (name, cell) = (NodeName::from_static("edge"), NodeName::from_static("lot"));
+        let name = NodeName::from_static("edge");
+        let cell = NodeName::from_static("lot");
         let month_us = 30 * 86_400 * 1_000_000;
         let now = clock::now();
         for (issued_at, is_wrong) in [
@@ -308,7 +309,8 @@ mod tests {
                 .issue(&name, Role::Edge, Duration::from_secs(3600), issued_at)
                 .unwrap();
             let tls = authority.tls_of(&name);
-            let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
+            let mqtt = MqttConfig::default();
+            let membership = MembershipConfig::default();
             let security =
                 Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
             let fault = security.clock_fault();
@@ -324,10 +326,8 @@ mod tests {
 
     #[test]
     fn a_signed_round_is_its_aggregators_and_any_change_shows() {
-        let (cell, [edge, euclid]) = (
-            NodeName::from_static("lot"),
-            ["edge", "euclid"].map(NodeName::from_static),
-        );
+        let cell = NodeName::from_static("lot");
+        let [edge, euclid] = ["edge", "euclid"].map(NodeName::from_static);
         let directory = tempfile::tempdir().unwrap();
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let [of_edge, of_euclid] = [&edge, &euclid].map(|name| {
@@ -342,7 +342,8 @@ mod tests {
                 revocation_list: None,
                 city: None,
             };
-            let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
+            let mqtt = MqttConfig::default();
+            let membership = MembershipConfig::default();
             Security::load(Some((&tls, name)), &mqtt, (&membership, &cell)).unwrap()
         });
         let certificate = of_edge
@@ -363,10 +364,8 @@ mod tests {
         };
         let (members, told) = watch::channel(vec![member]);
         let receiver = of_euclid.clone().with_members(told);
-        let (topic, payload) = (
-            "ecod/v1/lot/global_detections",
-            br#"{"schema":1,"round":7}"#.to_vec(),
-        );
+        let topic = "ecod/v1/lot/global_detections";
+        let payload = br#"{"schema":1,"round":7}"#.to_vec();
         let signed = of_edge.sign_round(topic, payload.clone());
         let check = |topic: &str, payload: &[u8]| {
             receiver.check_round(Some(&edge), topic.as_bytes(), payload)

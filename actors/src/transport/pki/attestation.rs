@@ -85,10 +85,8 @@ pub(super) fn is_issued_by(ca: &[u8], certificate: &[u8]) -> bool {
     ) else {
         return false;
     };
-    let (key, signature) = (
-        &ca.public_key().subject_public_key.data,
-        &certificate.signature_value.data,
-    );
+    let key = &ca.public_key().subject_public_key.data;
+    let signature = &certificate.signature_value.data;
     certificate.issuer() == ca.subject()
         && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
 }
@@ -101,10 +99,8 @@ pub(super) fn is_list_of(ca: &[u8], list: &[u8]) -> bool {
     ) else {
         return false;
     };
-    let (key, signature) = (
-        &ca.public_key().subject_public_key.data,
-        &list.signature_value.data,
-    );
+    let key = &ca.public_key().subject_public_key.data;
+    let signature = &list.signature_value.data;
     list.issuer() == ca.subject() && is_signed_with(key, list.tbs_cert_list.as_ref(), signature)
 }
 

@@ -546,7 +546,8 @@ mod tests {
 
     #[test]
     fn a_ca_is_made_once_and_its_keys_are_for_its_owner_only() {
-        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot-1");
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         authority
             .issue(
@@ -569,7 +570,8 @@ mod tests {
 
     #[test]
     fn a_ca_that_was_left_half_made_can_be_made_again() {
-        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot-1");
         let obstacle = directory.path().join("issued.tmp");
         fs::create_dir(&obstacle).unwrap();
         Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
@@ -588,7 +590,8 @@ mod tests {
 
     #[test]
     fn commands_that_run_at_once_lose_nothing_of_each_other() {
-        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot-1");
         let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(NodeName::from_static);
         let mut long = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         long.issue(&edge, Role::Edge, days(1), clock::now())
@@ -611,7 +614,8 @@ mod tests {
 
     #[test]
     fn a_register_with_one_wrong_byte_is_told_and_not_used() {
-        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot-1");
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         authority
             .issue(
@@ -635,11 +639,10 @@ mod tests {
 
     #[test]
     fn only_what_was_issued_can_be_revoked_and_once() {
-        let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
-        let (edge, euclid) = (
-            NodeName::from_static("edge"),
-            NodeName::from_static("euclid"),
-        );
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot-1");
+        let edge = NodeName::from_static("edge");
+        let euclid = NodeName::from_static("euclid");
         Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let mut authority = Authority::open(directory.path()).unwrap();
         for _ in 0..2 {

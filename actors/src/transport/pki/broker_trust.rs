@@ -259,7 +259,8 @@ mod tests {
                 .issue(name, Role::Auto, valid, clock::now())
                 .unwrap();
         }
-        let ((certificate, key), list) = (authority.files_of(&euclid), authority.revocation_list());
+        let (certificate, key) = authority.files_of(&euclid);
+        let list = authority.revocation_list();
         let files = TlsConfig {
             ca: authority.ca(),
             certificate,
@@ -293,7 +294,8 @@ mod tests {
 
     #[tokio::test]
     async fn all_connections_to_a_revoked_broker_end_as_soon_as_the_list_is_read() {
-        let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+        let directory = tempfile::tempdir().unwrap();
+        let edge = NodeName::from_static("edge");
         let (mut authority, credentials) = credentials(directory.path());
         let mut connections = tokio::task::JoinSet::new();
         for _ in 0..4 {
@@ -320,7 +322,8 @@ mod tests {
         let (mut authority, credentials) = credentials(directory.path());
         let [edge, brief] = ["edge", "brief"].map(NodeName::from_static);
         let connected = |broker: &NodeName| connected(&credentials, &authority, broker);
-        let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));
+        let mut brief_trust = connected(&brief);
+        let mut edge_trust = connected(&edge);
         assert_eq!(
             brief_trust.recheck(Instant::now() + RECHECK_INTERVAL),
             Ok(())

@@ -156,7 +156,8 @@ impl Credentials {
     /// # Errors
     /// Returns a [`CredentialsError`] that names the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
-        let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
+        let fingerprints = fingerprints(files);
+        let current = Arc::new(read(files, node)?);
         let cache = Mutex::new(CachedCredentials {
             checked_at: Instant::now(),
             fingerprints,
@@ -181,7 +182,8 @@ impl Credentials {
         if rights.allow(role, priority) {
             return Ok(());
         }
-        let (path, node) = (self.files.certificate.clone(), self.node.clone());
+        let path = self.files.certificate.clone();
+        let node = self.node.clone();
         Err(CredentialsError::Overreached {
             path,
             node,
@@ -332,7 +334,8 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     let identity = subject_of(&issuers, own)
         .map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
     if !identity.may_act_as(node.as_str()) {
-        let (path, found) = (files.certificate.clone(), identity.name().clone());
+        let path = files.certificate.clone();
+        let found = identity.name().clone();
         return Err(CredentialsError::WrongName {
             path,
             found,
@@ -357,10 +360,8 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
-    let (brokers, doors) = (
-        ServingNodes::brokers(&issuers),
-        ServingNodes::doors(&issuers),
-    );
+    let brokers = ServingNodes::brokers(&issuers);
+    let doors = ServingNodes::doors(&issuers);
     let broker_name = ServerName::try_from(BROKER_NAME);
     let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let mut client = ClientConfig::builder_with_provider(crypto())
@@ -374,7 +375,8 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .with_client_auth_cert(certificates.clone(), key.clone_key())
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
-    let (server, client) = (Arc::new(server), Arc::new(client));
+    let server = Arc::new(server);
+    let client = Arc::new(client);
     Ok(LoadedCredentials {
         ca_validity: issuers.validity_of_issuer(own),
         identity,
@@ -515,7 +517,8 @@ mod tests {
 
     #[test]
     fn a_revocation_list_without_a_list_is_refused_and_the_one_before_stays_in_use() {
-        let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+        let directory = tempfile::tempdir().unwrap();
+        let edge = NodeName::from_static("edge");
         let mut authority = Authority::init(
             directory.path(),
             &NodeName::from_static("lot"),
@@ -525,10 +528,8 @@ mod tests {
         authority
             .issue(&edge, Role::Edge, Duration::from_secs(60), clock::now())
             .unwrap();
-        let ((certificate, key), list) = (
-            authority.files_of(&edge),
-            directory.path().join("copied.pem"),
-        );
+        let (certificate, key) = authority.files_of(&edge);
+        let list = directory.path().join("copied.pem");
         fs::copy(authority.revocation_list(), &list).unwrap();
         let files = TlsConfig {
             ca: authority.ca(),
@@ -562,10 +563,8 @@ mod tests {
 
     #[test]
     fn a_node_that_is_to_be_more_than_its_certificate_allows_is_told_both() {
-        let (directory, euclid) = (
-            tempfile::tempdir().unwrap(),
-            NodeName::from_static("euclid"),
-        );
+        let directory = tempfile::tempdir().unwrap();
+        let euclid = NodeName::from_static("euclid");
         let mut authority = Authority::init(
             directory.path(),
             &NodeName::from_static("lot"),

@@ -223,7 +223,8 @@ mod tests {
     ) -> EvidenceSigner {
         authority.issue(&name(node), role, valid, now).unwrap();
         let (certificate, key) = authority.files_of(&name(node));
-        let (ca, list) = (authority.ca(), authority.revocation_list());
+        let ca = authority.ca();
+        let list = authority.revocation_list();
         let files = TlsConfig {
             ca,
             certificate,
@@ -244,7 +245,9 @@ mod tests {
     }
 
     fn share(aggregator: &str) -> LedgerShare {
-        let (aggregator, node, label) = (name(aggregator), name("gauss"), "cup".into());
+        let aggregator = name(aggregator);
+        let node = name("gauss");
+        let label = "cup".into();
         LedgerShare {
             schema: SCHEMA_VERSION,
             node: aggregator.clone(),

@@ -27,8 +27,8 @@ impl Path {
                 let Ok(far) = TcpStream::connect(broker).await else {
                     continue;
                 };
-                let ((near_in, near_out), (far_in, far_out)) =
-                    (near.into_split(), far.into_split());
+                let (near_in, near_out) = near.into_split();
+                let (far_in, far_out) = far.into_split();
                 tokio::spawn(pass(near_in, far_out, blocked.subscribe()));
                 tokio::spawn(pass(far_in, near_out, blocked.subscribe()));
             }

@@ -69,10 +69,8 @@ fn command(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Comman
 
 /// A node's certificates, if the cell has a CA in its directory.
 fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
-    let (mut authority, node) = (
-        Authority::open(&directory.join(CA)).ok()?,
-        NodeName::new(name).unwrap(),
-    );
+    let mut authority = Authority::open(&directory.join(CA)).ok()?;
+    let node = NodeName::new(name).unwrap();
     authority
         .issue(&node, role, Duration::from_secs(3600), clock::now())
         .unwrap();

@@ -86,7 +86,8 @@ impl Record {
             .collect();
         assert!(rounds.len() > 5, "only {rounds:?}");
         for pair in rounds.windows(2) {
-            let (next, may_repeat) = (pair[0].0 + 1, pair[1].1 != pair[0].1 && pair[1].1 != owner);
+            let next = pair[0].0 + 1;
+            let may_repeat = pair[1].1 != pair[0].1 && pair[1].1 != owner;
             assert!(
                 pair[1].0 == next || may_repeat && pair[1].0 < next,
                 "{:?} after {:?}",

@@ -124,10 +124,8 @@ impl Cell {
             .filter_map(|(_, node)| node.gossip_address());
         config.membership.seeds = seeds.map(|address| address.to_string()).collect();
         if let Some(authority) = &mut self.authority {
-            let (node, year) = (
-                NodeName::new(name).unwrap(),
-                Duration::from_secs(365 * 86_400),
-            );
+            let node = NodeName::new(name).unwrap();
+            let year = Duration::from_secs(365 * 86_400);
             authority
                 .issue(
                     &node,
@@ -262,10 +260,8 @@ impl Cell {
 
     /// Every round that a node accepts from now on, and when.
     pub(crate) fn watch(&self, name: &str) -> Arc<Mutex<Vec<(Round, Instant)>>> {
-        let (mut maps, seen) = (
-            self.node(name).newest_map(),
-            Arc::<Mutex<Vec<_>>>::default(),
-        );
+        let mut maps = self.node(name).newest_map();
+        let seen = Arc::<Mutex<Vec<_>>>::default();
         let rounds = Arc::clone(&seen);
         tokio::spawn(async move {
             while maps.changed().await.is_ok() {
@@ -338,11 +334,10 @@ impl Program {
                 .await
                 .unwrap();
         }
-        let (heard, answers) = (
-            Arc::<Mutex<Vec<_>>>::default(),
-            Arc::<Mutex<Vec<_>>>::default(),
-        );
-        let (messages, acknowledgements) = (Arc::clone(&heard), Arc::clone(&answers));
+        let heard = Arc::<Mutex<Vec<_>>>::default();
+        let answers = Arc::<Mutex<Vec<_>>>::default();
+        let messages = Arc::clone(&heard);
+        let acknowledgements = Arc::clone(&answers);
         let (ready, mut is_ready) = tokio::sync::mpsc::unbounded_channel();
         let task = tokio::spawn(async move {
             loop {

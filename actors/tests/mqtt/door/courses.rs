@@ -91,7 +91,8 @@ async fn verdicts_reputations_and_statuses_go_on_at_the_doors_when_the_leader_is
         config.reputations.publish_period_s = 0.1;
     })
     .await;
-    let (mut voters, mut displays) = (Vec::new(), Vec::new());
+    let mut voters = Vec::new();
+    let mut displays = Vec::new();
     for node in ["gauss", "noether", "euclid"] {
         voters.push((
             format!("{node}--lidar"),

@@ -176,7 +176,8 @@ async fn a_node_that_stalls_after_its_login_accuses_no_broker() {
 
 #[tokio::test]
 async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
-    let ((_first, one), (_second, two)) = (embedded(), embedded());
+    let (_first, one) = embedded();
+    let (_second, two) = embedded();
     let mut edge = Node::join(
         "edge",
         SubscriptionRole::Candidate,

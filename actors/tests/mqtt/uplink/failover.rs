@@ -31,11 +31,10 @@ fn spawn(
     directory: &Path,
 ) -> Process {
     let mut config = config("north", broker.address());
-    (config.name, config.role) = (Some(NodeName::from_static(name)), role);
-    (config.state_dir, config.map_log) = (
-        Some(directory.into()),
-        Some(directory.join(format!("{name}.maps"))),
-    );
+    config.name = Some(NodeName::from_static(name));
+    config.role = role;
+    config.state_dir = Some(directory.into());
+    config.map_log = Some(directory.join(format!("{name}.maps")));
     config.membership.bind = Some(if role == Role::Edge {
         seed
     } else {
@@ -105,10 +104,8 @@ async fn a_new_leader_goes_on_with_the_uplink() {
         })
         .await;
         tokio::time::sleep(Duration::from_secs(2)).await;
-        let (of_region, of_cell) = (
-            longest_gap(&maps()[at_kill..]),
-            longest_gap_in_cell(directory.path()),
-        );
+        let of_region = longest_gap(&maps()[at_kill..]);
+        let of_cell = longest_gap_in_cell(directory.path());
         eprintln!(
             "{}: edge killed, gap in the cell {of_cell:?}, in the region {of_region:?}",
             broker.name()
@@ -141,7 +138,8 @@ async fn a_new_leader_goes_on_with_the_uplink() {
                 .all(|(message, _)| of_edge(message))
         };
         until("no other leader's maps", async || is_alone()).await;
-        let (maps, sent) = (maps(), subscriber.maps("north").len());
+        let maps = maps();
+        let sent = subscriber.maps("north").len();
         eprintln!(
             "{}: {} of {sent} maps are later than all before",
             broker.name(),

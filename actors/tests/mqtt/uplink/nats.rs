@@ -73,7 +73,8 @@ impl Drop for Nats {
 
 /// Starts the server; returns it and the port for MQTT once it listens there.
 fn spawn(directory: &Path, port: Option<u16>) -> (Child, u16) {
-    let (settings, log) = (directory.join("settings.conf"), directory.join("nats.log"));
+    let settings = directory.join("settings.conf");
+    let log = directory.join("nats.log");
     let text = std::fs::read_to_string(&settings).unwrap();
     let port = port.map_or_else(|| "-1".to_owned(), |port| port.to_string());
     let file = directory.join("nats.conf");

@@ -62,10 +62,8 @@ async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {
         let subscriber = Subscriber::new(&broker.address());
         let mut north_config = config("north", broker.address());
         north_config.origin = Some(north_of(60.0));
-        let (south, north) = (
-            start(config("south", broker.address())).await,
-            start(north_config).await,
-        );
+        let south = start(config("south", broker.address())).await;
+        let north = start(north_config).await;
         let look = || {
             see(&south, 3.0, 40.0);
             see(&north, 0.0, 25.0);
@@ -83,14 +81,16 @@ async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {
         let near = neighbour_objects(&north).pop().unwrap();
         assert_eq!(near.cell.as_str(), "south");
         // 20 m south of the northern cell's origin.
-        let (x_m, y_m) = (near.object.x_m, near.object.y_m);
+        let x_m = near.object.x_m;
+        let y_m = near.object.y_m;
         assert!(
             (x_m - 3.0).abs() < 0.5 && (y_m + 20.0).abs() < 0.5,
             "{x_m} {y_m}"
         );
         assert!(near.age_s < 1.5, "{}", near.age_s);
 
-        let (begun, first_round) = (subscriber.maps("south").len(), round(&south));
+        let begun = subscriber.maps("south").len();
+        let first_round = round(&south);
         let since = clock::now();
         while clock::now().since(since) < Duration::from_secs(3) {
             look();
@@ -118,7 +118,8 @@ async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {
         assert!(north.counters().events(Event::CellMapAccepted) > 10);
 
         // Strangers are counted by cell, and change nothing.
-        let (tile, kind) = (Quadkey::of_cell(&ORIGIN), RegionTopicKind::Map);
+        let tile = Quadkey::of_cell(&ORIGIN);
+        let kind = RegionTopicKind::Map;
         let of = |cell| RegionTopic {
             tile,
             cell: NodeName::from_static(cell),

@@ -22,17 +22,20 @@ async fn a_cell_goes_on_without_its_region_and_no_old_map_is_sent_later() {
             subscriber.maps("north").len() >= 3
         })
         .await;
-        let (first, begun_at) = (round(&node), clock::now());
+        let first = round(&node);
+        let begun_at = clock::now();
         tokio::time::sleep(Duration::from_secs(2)).await;
         let usual_hz = (round(&node) - first) as f64 / clock::now().since(begun_at).as_secs_f64();
         broker.kill();
-        let (before, cut_at) = (round(&node), clock::now());
+        let before = round(&node);
+        let cut_at = clock::now();
         until("the trouble", async || {
             trouble(&node, "uplink_unreachable").is_some()
         })
         .await;
         tokio::time::sleep(Duration::from_secs(3)).await;
-        let (rounds, spent) = (round(&node) - before, clock::now().since(cut_at));
+        let rounds = round(&node) - before;
+        let spent = clock::now().since(cut_at);
         let hz = rounds as f64 / spent.as_secs_f64();
         eprintln!(
             "{}: {hz:.1} rounds a second in the cell while its region is gone",
@@ -123,7 +126,8 @@ async fn a_burst_of_old_maps_after_a_hang_reaches_nobody() {
 
     let mut filter = CellMapFilter::new(4);
     let admitted = maps.iter().filter(|(message, at)| {
-        let (tile, kind) = (Quadkey::of_cell(&message.origin), RegionTopicKind::Map);
+        let tile = Quadkey::of_cell(&message.origin);
+        let kind = RegionTopicKind::Map;
         filter
             .admit(
                 &RegionTopic {

@@ -20,8 +20,8 @@ use crate::uplink::region::{Broker, Subscriber};
 async fn wrong_credentials_are_told_and_right_ones_work() {
     for broker in Broker::both_with_user("north", "correct horse") {
         let mut wrong = config("north", broker.address());
-        (wrong.uplink.user, wrong.uplink.password) =
-            (Some("north".into()), Some(Secret::new("battery staple")));
+        wrong.uplink.user = Some("north".into());
+        wrong.uplink.password = Some(Secret::new("battery staple"));
         let mut right = wrong.clone();
         right.uplink.password = Some(Secret::new("correct horse"));
         let node = start(wrong).await;
@@ -60,8 +60,8 @@ async fn wrong_credentials_are_told_and_right_ones_work() {
 async fn missing_permissions_are_told() {
     let broker = Mosquitto::with_permissions("north", "correct horse", "topic read ecod/v1/geo/#");
     let mut config = config("north", broker.address());
-    (config.uplink.user, config.uplink.password) =
-        (Some("north".into()), Some(Secret::new("correct horse")));
+    config.uplink.user = Some("north".into());
+    config.uplink.password = Some(Secret::new("correct horse"));
     let node = start(config).await;
     until("the refusal", async || {
         trouble(&node, "broker_refuses").is_some()
@@ -135,7 +135,8 @@ async fn a_cell_without_origin_says_so() {
 /// A broker that asks for certificates takes the node's own; one with another certificate than `ca` says is refused.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn certificates_of_both_sides_are_checked() {
-    let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+    let directory = tempfile::tempdir().unwrap();
+    let name = NodeName::from_static("edge");
     let mut authority = Authority::init(
         directory.path(),
         &NodeName::from_static("north"),
@@ -155,7 +156,9 @@ async fn certificates_of_both_sides_are_checked() {
         (certificate, key)
     });
     let broker = Mosquitto::configured(|_| {
-        let (certificate, key, ca) = (region.0.display(), region.1.display(), authority.ca());
+        let certificate = region.0.display();
+        let key = region.1.display();
+        let ca = authority.ca();
         let files = format!(
             "certfile {certificate}\nkeyfile {key}\ncafile {}\n",
             ca.display()

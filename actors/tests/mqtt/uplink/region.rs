@@ -101,7 +101,8 @@ impl Subscriber {
         options.set_keep_alive(Duration::from_secs(60));
         let (client, mut events) = AsyncClient::new(options, 64);
         let heard = Arc::<Mutex<Vec<Heard>>>::default();
-        let (list, subscriber) = (Arc::clone(&heard), client.clone());
+        let list = Arc::clone(&heard);
+        let subscriber = client.clone();
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {

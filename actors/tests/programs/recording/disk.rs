@@ -167,7 +167,8 @@ async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
     for path in ["/dev/full", "/proc/maps.jsonl"] {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config("edge", Role::Edge, directory.path());
-        (config.map_log, config.record) = (Some(path.into()), None);
+        config.map_log = Some(path.into());
+        config.record = None;
         let node = node::start(config).await.unwrap();
         let mut maps = node.newest_map();
         let reached =

@@ -50,10 +50,8 @@ fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
             .add_channel(schema, topic, "json", &BTreeMap::new())
             .unwrap()
     };
-    let (reports, tea) = (
-        channel("ecod.ObjectReport", "detections/a"),
-        channel("ecod.Tea", "tea"),
-    );
+    let reports = channel("ecod.ObjectReport", "detections/a");
+    let tea = channel("ecod.Tea", "tea");
     for (second, channel_id) in [(1, reports), (2, tea), (3, reports)] {
         let micros: u64 = 1_732_154_400_000_000 + second * 1_000_000;
         let report = format!(
@@ -266,7 +264,8 @@ fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() 
         ("landmarks", r#"[{"id":"slot-0","x_m":1.5,"y_m":2.0}]"#),
     ];
     let other = file(&folder, "other.mcap", &log_with(&moved));
-    let ((_, alone, _), (_, other_alone, _)) = (replay(&[&one]), replay(&[&other]));
+    let (_, alone, _) = replay(&[&one]);
+    let (_, other_alone, _) = replay(&[&other]);
     let (code, lines, said) = replay(&[&one, &other]);
     assert_eq!((code, lines), (0, alone + other_alone), "{said}");
     assert_eq!(said.matches("2 lines, 2 used").count(), 2, "{said}");
@@ -287,10 +286,8 @@ fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() 
 #[test]
 fn what_is_no_log_is_refused_by_name() {
     let folder = TempDir::new().unwrap();
-    let (one, lines) = (
-        file(&folder, "one.mcap", &log(1)),
-        file(&folder, "lines.jsonl", b"{}\n"),
-    );
+    let one = file(&folder, "one.mcap", &log(1));
+    let lines = file(&folder, "lines.jsonl", b"{}\n");
     let (code, _, said) = replay(&[&one, &lines]);
     assert!(
         code == 2 && said.contains("lines.jsonl is not a log"),
@@ -306,10 +303,8 @@ fn what_is_no_log_is_refused_by_name() {
 #[test]
 fn a_report_is_one_page_with_everything_in_it() {
     let folder = TempDir::new().unwrap();
-    let (log, page) = (
-        file(&folder, "log.mcap", &log(1)),
-        folder.path().join("report.html"),
-    );
+    let log = file(&folder, "log.mcap", &log(1));
+    let page = folder.path().join("report.html");
     let report = |log: &Path| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
         command

@@ -20,7 +20,8 @@ fn view(port: u16, wanted: &[&str]) {
         Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\
         Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n";
     stream.write_all(request.as_bytes()).unwrap();
-    let (mut said, mut buffer) = (String::new(), [0; 4096]);
+    let mut said = String::new();
+    let mut buffer = [0; 4096];
     while !wanted.iter().all(|part| said.contains(part)) {
         let length = stream
             .read(&mut buffer)

@@ -61,10 +61,8 @@ fn the_python_reader_reads_a_finished_log_and_one_of_a_killed_process() {
             process.0.kill().unwrap();
             process.0.wait().unwrap();
         }
-        let (theirs, ours) = (
-            maps_by(&python, &dir, state),
-            Log::read(&dir).count(SchemaName::GlobalMap),
-        );
+        let theirs = maps_by(&python, &dir, state);
+        let ours = Log::read(&dir).count(SchemaName::GlobalMap);
         // Of a chunk that is cut short, this project's own reader takes what is whole.
         assert!(
             theirs >= 20 && theirs <= ours && (state == "killed" || theirs == ours),

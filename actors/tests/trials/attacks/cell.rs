@@ -543,7 +543,8 @@ fn configuration(
          [tls]\nca = {ca:?}\ncertificate = {certificate:?}\nkey = {key:?}\n{list}"
     );
     if role != "edge" {
-        let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
+        let frames = shared.join("frames");
+        let detections = shared.join("detections.jsonl");
         text += &format!(
             "\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\
              [camera.detector]\nkind = \"recorded\"\npath = {detections:?}\nlooping = true\n\n\

@@ -52,8 +52,10 @@ impl Insider {
             ..MembershipConfig::default()
         };
         config.multicast.enabled = false;
-        let (name, counters) = (NodeName::from_static(name), Arc::<FrameCounters>::default());
-        let (run, (sender, members)) = (clock::now().micros(), watch::channel(Vec::new()));
+        let name = NodeName::from_static(name);
+        let counters = Arc::<FrameCounters>::default();
+        let run = clock::now().micros();
+        let (sender, members) = watch::channel(Vec::new());
         let arguments = MembershipArguments {
             name: name.clone(),
             cell: NodeName::from_static(CELL),

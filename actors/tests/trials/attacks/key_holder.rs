@@ -124,7 +124,8 @@ async fn largest_counter(target: Target) -> anyhow::Result<()> {
 
 /// Passes datagrams on between the greeter and a node, and sends the node's to all others with the largest counter.
 async fn tap(socket: &UdpSocket, node: SocketAddr, target: &Target) -> anyhow::Result<()> {
-    let (mut frame, mut greeter) = ([0; MAX_DATAGRAM_BYTES], None);
+    let mut frame = [0; MAX_DATAGRAM_BYTES];
+    let mut greeter = None;
     loop {
         let (length, from) = socket.recv_from(&mut frame).await?;
         if from != node {

@@ -57,7 +57,8 @@ async fn revoked(target: Target) -> anyhow::Result<()> {
 
 /// A candidate that colludes vouches for the evidence: it counts until the list is read.
 async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
-    let (pki, leader) = (target.home.join("pki"), NodeName::from_static(LEADER));
+    let pki = target.home.join("pki");
+    let leader = NodeName::from_static(LEADER);
     let mut authority = Authority::open(&pki)?;
     let files = TlsConfig {
         revocation_list: None,

@@ -95,10 +95,8 @@ fn leaving_the_world(_: u64) -> Vec<PerceivedObject> {
 
 fn crowd(number: u64) -> Vec<PerceivedObject> {
     let place = |index: u64| {
-        let (turn, range_m) = (
-            TAU * (index * 89 % 1000) as f64 / 1000.0,
-            (index % 20) as f64,
-        );
+        let turn = TAU * (index * 89 % 1000) as f64 / 1000.0;
+        let range_m = (index % 20) as f64;
         let shift = 0.3 * (number % 7) as f64;
         PerceivedObject::new(
             "person",

@@ -201,13 +201,13 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
             (true, false) if outcome.ended.is_empty() => "BROKEN".to_owned(),
             (true, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
         };
-        let (attack, means, honest, rss) =
-            (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
-        let (gap, did, at) = (
-            outcome.longest_gap_ms,
-            format!("{} {}", outcome.deeds, row.deeds.1),
-            victim.name(),
-        );
+        let attack = row.attack;
+        let means = row.means.name();
+        let honest = outcome.honest;
+        let rss = outcome.rss_mb;
+        let gap = outcome.longest_gap_ms;
+        let did = format!("{} {}", outcome.deeds, row.deeds.1);
+        let at = victim.name();
         let _ = writeln!(
             text,
             "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {lies:>5}  {:27}  {verdict}",

@@ -184,7 +184,8 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
     // As many as the broker takes, and more than that.
     let packets = [(64 * 1024 - 2) / filter.len(), 10_000]
         .map(|filters| packet(0x82, &[&[0, 1], &filter.repeat(filters)]));
-    let (packets, target) = (&packets, &target);
+    let packets = &packets;
+    let target = &target;
     let ask = |number: usize| async move {
         let packet = &packets[number % 2];
         loop {
@@ -316,7 +317,8 @@ async fn log_in_by_websocket(target: &Target) -> anyhow::Result<TlsStream<TcpStr
 /// Vehicles follow the leader, and say that its broker, or others, cannot be reached.
 async fn no_login(target: Target, at: &'static [&'static str]) -> anyhow::Result<()> {
     let say = |(name, credentials): (&'static str, &Arc<Credentials>)| {
-        let (target, credentials) = (target.clone(), Arc::clone(credentials));
+        let target = target.clone();
+        let credentials = Arc::clone(credentials);
         async move {
             let insider = Insider::join(&target, (name, Role::Cav), Some(credentials)).await?;
             let no_login = at.iter().copied().map(NodeName::from_static).collect();

@@ -262,10 +262,8 @@ impl Cell {
     }
 
     fn set_file(&self, name: &str, clock: Fake) {
-        let (file, new) = (
-            self.path(&format!("{name}.faketime")),
-            self.path(&format!("{name}.faketime.new")),
-        );
+        let file = self.path(&format!("{name}.faketime"));
+        let new = self.path(&format!("{name}.faketime.new"));
         std::fs::write(&new, format!("{:+}\n", clock.seconds())).unwrap();
         std::fs::rename(new, file).unwrap();
     }
@@ -352,7 +350,8 @@ impl Cell {
         is_useful: impl Fn(&Entry<'_>) -> bool,
     ) -> Duration {
         let useful = self.record.times(since, is_useful);
-        let (mut longest, mut idle_since) = (Duration::ZERO, None);
+        let mut longest = Duration::ZERO;
+        let mut idle_since = None;
         for (at, is_ready) in self
             .claims
             .get(name)

@@ -39,7 +39,8 @@ pub(crate) fn open(
     log: &Path,
 ) -> anyhow::Result<Process> {
     let file = File::create(log).with_context(|| format!("cannot write {}", log.display()))?;
-    let (host, port) = (address.ip().to_string(), address.port().to_string());
+    let host = address.ip().to_string();
+    let port = address.port().to_string();
     let topic = format!("ecod/v1/{CELL}/global_detections");
     let mut client = command(Path::new(CLIENT), namespace);
     Process::start(
@@ -119,7 +120,8 @@ fn key(map: &Accepted) -> (&Epoch, u64) {
 /// Reads the client's time of a line: whole seconds and nanoseconds.
 pub(crate) fn time(text: &str) -> Option<Timestamp> {
     let (seconds, nanos) = text.split_once('.')?;
-    let (seconds, nanos): (u64, u64) = (seconds.parse().ok()?, nanos.parse().ok()?);
+    let seconds: u64 = seconds.parse().ok()?;
+    let nanos: u64 = nanos.parse().ok()?;
     Some(Timestamp(seconds * 1_000_000 + nanos / 1000))
 }
 
@@ -155,7 +157,8 @@ mod tests {
         flooded: Option<&NodeName>,
     ) -> DoorVerdict {
         let measured = BTreeSet::from([NodeName::from_static("a")]);
-        let (from, until) = (Timestamp(0), Timestamp(end_ms * 1000));
+        let from = Timestamp(0);
+        let until = Timestamp(end_ms * 1000);
         let phase = Phase {
             from,
             until,

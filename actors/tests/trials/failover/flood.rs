@@ -74,8 +74,8 @@ impl Flood {
         process: u32,
         other: &NodeName,
     ) -> anyhow::Result<Self> {
-        let (messages, resident_kib) =
-            (Arc::<AtomicU64>::default(), memory_kib(process, "VmRSS:")?);
+        let messages = Arc::<AtomicU64>::default();
+        let resident_kib = memory_kib(process, "VmRSS:")?;
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)
             .enable_all()

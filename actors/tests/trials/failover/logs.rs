@@ -182,7 +182,8 @@ mod tests {
 
     #[test]
     fn maps_without_a_node_count_from_a_time_on() {
-        let (maps, euclid) = (LINE.replace('\n', ""), NodeName::from_static("euclid"));
+        let maps = LINE.replace('\n', "");
+        let euclid = NodeName::from_static("euclid");
         let seen = maps.replace(
             r#""landmarks":[]"#,
             r#""landmarks":[{"contributors":["euclid"]}]"#,

@@ -91,7 +91,8 @@ impl Flood {
             most_grown_kib,
             unheard,
         } = *self;
-        let (least, most) = (Self::LEAST_MESSAGES, Self::GROWN_BAR_KIB);
+        let least = Self::LEAST_MESSAGES;
+        let most = Self::GROWN_BAR_KIB;
         let few = (least_messages < least)
             .then(|| format!("flood of {least_messages} messages, at least {least}"));
         let grown = (most_grown_kib > most)

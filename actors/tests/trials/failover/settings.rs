@@ -89,7 +89,8 @@ pub(crate) fn configuration(
         );
     }
     if index != EDGE {
-        let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));
+        let frames = shared.join("frames");
+        let detections = shared.join("detections.jsonl");
         let _ = write!(
             text,
             "\n[camera]\nvotes = {}\n\n[camera.source]\nkind = \"images\"\npath = {frames:?}\nlooping = true\n\n\

@@ -72,11 +72,9 @@ struct Minute {
 }
 
 async fn run() -> anyhow::Result<()> {
-    let (minutes, nodes, seed) = (
-        setting("MINUTES", 30)?,
-        setting("NODES", 32)? as usize,
-        setting("SEED", 1)?,
-    );
+    let minutes = setting("MINUTES", 30)?;
+    let nodes = setting("NODES", 32)? as usize;
+    let seed = setting("SEED", 1)?;
     if nodes < disturbance::LEAST_NODES {
         bail!(
             "NODES={nodes}: a soak takes {} or more",
@@ -122,7 +120,8 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     let mut series: BTreeMap<String, Series> = BTreeMap::new();
     cell.settle().await?;
     for number in 1..=minutes {
-        let (began, from) = (Instant::now(), clock::now());
+        let began = Instant::now();
+        let from = clock::now();
         let disturbance = Disturbance::draw(&mut rng, bridged);
         disturbance.carry_out(cell, &mut intruder, &mut rng).await?;
         let over = Instant::now();
@@ -234,7 +233,8 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         let well = minute
             .recovered_after_ms
             .map_or_else(|| "never".to_owned(), |ms| format!("{ms} ms"));
-        let (what, gap) = (&minute.disturbance, minute.longest_gap_ms);
+        let what = &minute.disturbance;
+        let gap = minute.longest_gap_ms;
         println!(
             "{:>6}  {what:<44}{gap:>10}{well:>12}  {:<8}{}",
             number + 1,

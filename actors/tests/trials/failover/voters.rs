@@ -143,7 +143,8 @@ fn vote(node: NodeName, label: &str, seq: u64) -> ObjectReport {
         landmark: Some(LANDMARK.into()),
         ..PerceivedObject::new(label, 0.9, 6.0, 0.0)
     };
-    let (_schema, captured_at_us) = (SCHEMA_VERSION, clock::now());
+    let _schema = SCHEMA_VERSION;
+    let captured_at_us = clock::now();
     ObjectReport {
         objects: vec![object],
         ..ObjectReport::new(node, seq, captured_at_us)

@@ -59,10 +59,8 @@ impl Machine {
     /// A machine with the package's unit, and a systemd that runs it.
     fn with_service(number: usize) -> Self {
         let machine = Self::new(number);
-        let (files, unit) = (
-            machine.files.path(),
-            "../packaging/systemd/ecod-node.service",
-        );
+        let files = machine.files.path();
+        let unit = "../packaging/systemd/ecod-node.service";
         fs::create_dir_all(files.join("run/systemd/system")).unwrap();
         fs::create_dir_all(files.join("etc/systemd/system")).unwrap();
         let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join(unit);
@@ -80,7 +78,8 @@ impl Machine {
     /// A command of the README as root of this machine has it.
     fn command(&self, line: &str) -> Command {
         let program = PathBuf::from(env!("CARGO_BIN_EXE_ecod-node"));
-        let (system, programs) = (self.files.path().join("bin"), program.parent().unwrap());
+        let system = self.files.path().join("bin");
+        let programs = program.parent().unwrap();
         let path = format!(
             "{}:{}:{}",
             system.display(),

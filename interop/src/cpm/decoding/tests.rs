@@ -31,7 +31,8 @@ fn coordinate(value: i32, confidence: u16) -> cdd::CartesianCoordinateWithConfid
 
 /// An object 10 m east and 20 m north, measured at the reference time, without optional fields.
 fn object() -> cdd::PerceivedObject {
-    let (x_coordinate, y_coordinate) = (coordinate(1000, 196), coordinate(2000, 98));
+    let x_coordinate = coordinate(1000, 196);
+    let y_coordinate = coordinate(2000, 98);
     let position = cdd::CartesianPosition3dWithConfidence {
         x_coordinate,
         y_coordinate,
@@ -141,7 +142,8 @@ fn cartesian(x: i16, y: i16, confidence: u8) -> Option<cdd::Velocity3dWithConfid
             cdd::SpeedConfidence(confidence),
         )
     };
-    let (x_velocity, y_velocity) = (component(x), component(y));
+    let x_velocity = component(x);
+    let y_velocity = component(y);
     let velocity = cdd::VelocityCartesian {
         x_velocity,
         y_velocity,
@@ -151,10 +153,8 @@ fn cartesian(x: i16, y: i16, confidence: u8) -> Option<cdd::Velocity3dWithConfid
 }
 
 fn polar(speed: u16, tenth_degrees: u16) -> Option<cdd::Velocity3dWithConfidence> {
-    let (magnitude, direction) = (
-        cdd::Speed::new(cdd::SpeedValue(speed), cdd::SpeedConfidence(127)),
-        angle(tenth_degrees),
-    );
+    let magnitude = cdd::Speed::new(cdd::SpeedValue(speed), cdd::SpeedConfidence(127));
+    let direction = angle(tenth_degrees);
     Some(cdd::Velocity3dWithConfidence::polarVelocity(
         cdd::VelocityPolarWithZ::new(magnitude, direction, None),
     ))
@@ -323,7 +323,8 @@ fn the_error_of_the_reference_position_adds_to_that_of_each_object() {
     };
     // Standard deviations of 1.6342 m and 0.8171 m, to the north-east, then to the east.
     let [along, across] = [(4.0_f64 / 2.4477).powi(2), (2.0_f64 / 2.4477).powi(2)];
-    let (mean, half) = ((along + across) / 2.0, (along - across) / 2.0);
+    let mean = (along + across) / 2.0;
+    let half = (along - across) / 2.0;
     assert_near(
         covariance((400, 200, 450)),
         [1.0 + mean, half, 0.25 + mean],

@@ -192,7 +192,9 @@ fn boxes_are_placed_alike_in_a_whole_picture_and_in_a_binned_part_of_it() {
         ))
         .unwrap()
     };
-    let (fx, cx, cy) = (900.0, 640.0, 480.0);
+    let fx = 900.0;
+    let cx = 640.0;
+    let cy = 480.0;
     let k = [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0];
     let whole = CameraInfo {
         width: 1280,
@@ -266,7 +268,8 @@ fn a_camera_that_moves_is_where_it_was_at_the_stamp() {
         )
         .unwrap();
     assert!(refused.is_empty(), "{refused:?}");
-    let (stated, object) = (frame.pose.unwrap(), &frame.objects[0]);
+    let stated = frame.pose.unwrap();
+    let object = &frame.objects[0];
     let all = [
         stated.x_m,
         stated.y_m,

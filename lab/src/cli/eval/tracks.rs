@@ -135,7 +135,8 @@ fn judge_maps(
         return Err(anyhow!("there is no map in {}", input.display()).into());
     }
     if let Some(sequences) = sequences.filter(|sequences| !sequences.contains(&mapped.len())) {
-        let (sequences, mapped) = (sequences.end(), mapped.len());
+        let sequences = sequences.end();
+        let mapped = mapped.len();
         let what = format!(
             "{truth} has {sequences} sequences, and {} maps of {mapped}: give truth of just these",
             input.display()

@@ -60,7 +60,8 @@ fn ground(cells: &Cells) -> Result<Option<Point2<f64>>, LineError> {
 }
 
 fn image(cells: &Cells) -> Result<BoundingBox, LineError> {
-    let (x_min, y_min) = (cells.number(3, "left")?, cells.number(4, "top")?);
+    let x_min = cells.number(3, "left")?;
+    let y_min = cells.number(4, "top")?;
     Ok(BoundingBox {
         x_min,
         y_min,

@@ -51,7 +51,8 @@ pub(super) fn placed(
     let mut camera = camera.cloned();
     for (number, objects) in frames {
         let mut placed = Vec::new();
-        let (mut ids, mut boxes) = (Vec::new(), Vec::new());
+        let mut ids = Vec::new();
+        let mut boxes = Vec::new();
         for ParsedObject {
             id,
             label,

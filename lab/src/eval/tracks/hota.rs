@@ -62,7 +62,8 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
             }
         }
     }
-    let (objects, said): (f64, f64) = (lives.truth.values().sum(), lives.said.values().sum());
+    let objects: f64 = lives.truth.values().sum();
+    let said: f64 = lives.said.values().sum();
     let all: Vec<Hota> = at
         .iter()
         .map(|threshold| threshold.scores(&lives, objects, said))
@@ -88,8 +89,8 @@ impl Lives {
     fn of(frames: &[ScoredFrame], similar: &[Vec<MatchedPair>]) -> Self {
         let mut lives = Self::default();
         for (frame, pairs) in frames.iter().zip(similar) {
-            let (mut of_truth, mut of_said) =
-                (vec![0.0; frame.truth.len()], vec![0.0; frame.said.len()]);
+            let mut of_truth = vec![0.0; frame.truth.len()];
+            let mut of_said = vec![0.0; frame.said.len()];
             for pair in pairs {
                 of_truth[pair.truth] += pair.value;
                 of_said[pair.said] += pair.value;

@@ -127,7 +127,8 @@ fn verdicts(frames: &[ScoredFrame], limit_m: f64) -> Vec<RankedObject<'_>> {
 
 fn curve(mut verdicts: Vec<RankedObject<'_>>, objects: u64) -> Vec<Point> {
     verdicts.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let (mut right, mut all) = (0u64, 0u64);
+    let mut right = 0u64;
+    let mut all = 0u64;
     let mut points = Vec::new();
     for equal in verdicts.chunk_by(|a, b| a.score == b.score) {
         right += equal.iter().filter(|verdict| verdict.is_right).count() as u64;
@@ -142,7 +143,8 @@ fn curve(mut verdicts: Vec<RankedObject<'_>>, objects: u64) -> Vec<Point> {
 }
 
 fn average_precision(points: &[Point]) -> f64 {
-    let (mut area, mut precision) = (0.0, 0.0);
+    let mut area = 0.0;
+    let mut precision = 0.0;
     for (place, point) in points.iter().enumerate().rev() {
         precision = point.precision.max(precision);
         let before = if place > 0 {

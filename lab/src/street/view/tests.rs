@@ -33,7 +33,8 @@ fn camera(
     [x_m, y_m, heading_deg]: [f64; 3],
     [height_m, pitch_deg, roll_deg]: [f64; 3],
 ) -> StreetCamera {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     StreetCamera {
         name: NodeName::from_static("camera"),
         carrier: Carrier::Mast(Pose::new(x_m, y_m, heading_deg.to_radians())),
@@ -99,16 +100,16 @@ fn whole_box(alone: &Mat, bare: &Mat, full: &Mat) -> Option<BoundingBox> {
             if alone_px != full_px {
                 return None;
             }
-            let (row, column) = (
-                number / alone.cols() as usize,
-                number % alone.cols() as usize,
-            );
+            let row = number / alone.cols() as usize;
+            let column = number % alone.cols() as usize;
             pixels.push(Point2::new(column as f64, row as f64));
         }
     }
     let bounds = BoundingBox::around(&pixels);
-    let (width, height) = (f64::from(alone.cols()), f64::from(alone.rows()));
-    let (x_max, y_max) = (bounds.x_max + 1.0, bounds.y_max + 1.0);
+    let width = f64::from(alone.cols());
+    let height = f64::from(alone.rows());
+    let x_max = bounds.x_max + 1.0;
+    let y_max = bounds.y_max + 1.0;
     let is_whole = bounds.x_min > 0.0 && bounds.y_min > 0.0 && x_max < width && y_max < height;
     (is_whole && bounds.height() >= MIN_BOX_PX).then_some(BoundingBox {
         x_max,

@@ -53,7 +53,8 @@ impl Sheet {
         let lacking =
             (high - low).map(|side| (Self::MIN_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
         let room = lacking.add_scalar(Self::PADDING_M);
-        let (low, high) = (low - room, high + room + Vector2::new(Self::NAMES_M, 0.0));
+        let low = low - room;
+        let high = high + room + Vector2::new(Self::NAMES_M, 0.0);
         Self {
             low,
             high,
@@ -115,7 +116,10 @@ impl Sheet {
 
     /// Grid and numbers along the lower and the right side of the frame.
     pub(super) fn axes(&self) -> Group {
-        let (left, right, top, bottom) = (self.left(), self.right(), self.top(), self.bottom());
+        let left = self.left();
+        let right = self.right();
+        let top = self.top();
+        let bottom = self.bottom();
         let mut grid = Group::new().set("stroke", "#ededed");
         let mut numbers = Group::new().set("fill", FAINT).set("font-size", 11);
         let step = self.tick_in();
@@ -148,9 +152,7 @@ impl Sheet {
 
 /// Multiples of `step` inches between two places in metres.
 fn ticks(low_m: f64, high_m: f64, step: f64) -> impl Iterator<Item = f64> {
-    let (first, last) = (
-        (low_m / METRES_PER_INCH / step).ceil(),
-        (high_m / METRES_PER_INCH / step).floor(),
-    );
+    let first = (low_m / METRES_PER_INCH / step).ceil();
+    let last = (high_m / METRES_PER_INCH / step).floor();
     (first as i64..=last as i64).map(move |index| index as f64 * step)
 }

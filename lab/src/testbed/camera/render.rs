@@ -41,7 +41,8 @@ pub(super) fn still(
         .iter()
         .map(|card| Face::new(card, &view))
         .collect::<Result<Vec<_>, _>>()?;
-    let (width, height) = (camera.width as usize, camera.height as usize);
+    let width = camera.width as usize;
+    let height = camera.height as usize;
     let mut light = vec![[0f32; 3]; width * height];
     for row in 0..height * SAMPLES {
         let middle = view.to_level * camera.ray(&Point2::new(camera.cx, centre(row)));
@@ -66,7 +67,8 @@ pub(super) fn still(
         }
     }
     let error = RenderError::at("allocating a view");
-    let (rows, columns) = (camera.height.cast_signed(), camera.width.cast_signed());
+    let rows = camera.height.cast_signed();
+    let columns = camera.width.cast_signed();
     let mut image = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, Scalar::default())
         .map_err(error)?;
     let pixels = image
@@ -248,7 +250,8 @@ impl<'a> RenderView<'a> {
         let approach = sight.dot(&face.facing);
         let depth_m = (face.card.position - self.pose.position).dot(&face.facing) / approach;
         let at = self.pose.position + sight * depth_m - face.card.position;
-        let (right_m, up_m) = (face.facing.x * at.y - face.facing.y * at.x, depth_m * rise);
+        let right_m = face.facing.x * at.y - face.facing.y * at.x;
+        let up_m = depth_m * rise;
         let is_met = depth_m >= NEAR_M
             && right_m.abs() <= self.placard.card_width_m / 2.0
             && (self.bottom_m..=self.top_m).contains(&up_m);
@@ -284,8 +287,10 @@ fn grain(at: Point2<f64>) -> f64 {
         let mixed = (mixed ^ (mixed >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         (mixed >> 40) as f64 / f64::from(1 << 23) - 1.0
     };
-    let (x, y) = (at.x.floor(), at.y.floor());
-    let (u, v) = (at.x - x, at.y - y);
+    let x = at.x.floor();
+    let y = at.y.floor();
+    let u = at.x - x;
+    let v = at.y - y;
     let upper = corner(x, y) * (1.0 - u) + corner(x + 1.0, y) * u;
     let lower = corner(x, y + 1.0) * (1.0 - u) + corner(x + 1.0, y + 1.0) * u;
     upper * (1.0 - v) + lower * v

@@ -66,10 +66,8 @@ impl Sensor {
 
     /// Uneven light and noise, in place.
     fn develop(&self, frame: &mut Mat, rng: &mut ChaCha8Rng) -> Result<(), RenderError> {
-        let (columns, rows) = (
-            frame.cols().unsigned_abs() as usize,
-            frame.rows().unsigned_abs() as usize,
-        );
+        let columns = frame.cols().unsigned_abs() as usize;
+        let rows = frame.rows().unsigned_abs() as usize;
         let exposure = 1.0 + EXPOSURE * normal(rng);
         let sigma = rng.random_range(NOISE[0]..=NOISE[1]) as f32;
         let across: Vec<f32> = (0..3 * columns)

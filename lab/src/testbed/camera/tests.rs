@@ -14,7 +14,8 @@ fn gray(image: &Mat, x: usize, y: usize) -> f64 {
 /// with the objects `before` in front of it.
 fn lot(x_in: f64, yaw_deg: f64, before: &str) -> Testbed {
     let (sin, cos) = yaw_deg.to_radians().sin_cos();
-    let (x, y) = (x_in - 3.5 * cos, 1.0 - 3.5 * sin);
+    let x = x_in - 3.5 * cos;
+    let y = 1.0 - 3.5 * sin;
     Testbed::from_json(&format!(
         r#"{{"camera": {{"image_width": 640, "image_height": 480, "horizontal_fov_deg": 62.2, "vertical_fov_deg": 48.8}},
         "placard": {{"qr_width": 1.9375, "qr_with_quiet_zone": 2.5, "card_width": 2.75, "card_height": 5.5, "empty_text": "EMPTY"}},
@@ -55,10 +56,8 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
         for (right, up) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
             let project = |right_m: f64, up_m: f64| {
                 let (sin, cos) = card.facing_rad.sin_cos();
-                let (x, y) = (
-                    card.position.x - sin * right_m,
-                    card.position.y + cos * right_m,
-                );
+                let x = card.position.x - sin * right_m;
+                let y = card.position.y + cos * right_m;
                 camera
                     .project(&nalgebra::Point3::new(-y, -up_m, x))
                     .unwrap()
@@ -92,7 +91,8 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
 fn a_nearer_placard_hides_a_farther_one() {
     let before =
         r#", {"id": 1, "occupied_placard": [8, 0.5], "empty_placard": null, "truth": "NEAR"}"#;
-    let (one, two) = (lot(16.0, 180.0, ""), lot(16.0, 180.0, before));
+    let one = lot(16.0, 180.0, "");
+    let two = lot(16.0, 180.0, before);
     let scene = &two.scenes[0];
     assert!(
         two.sighting(scene, &scene.cavs[0], &scene.spots[0])
@@ -107,7 +107,8 @@ fn a_nearer_placard_hides_a_farther_one() {
         )
         .is_some()
     );
-    let (first, second) = (still(&two), still(&lot(16.0, 210.0, alone)));
+    let first = still(&two);
+    let second = still(&lot(16.0, 210.0, alone));
     // The nearer card covers the card behind it and that card's rotation.
     let near = &two.cards(scene)[2];
     let seen = Sighting::of(near, &[], &scene.cavs[0].pose, &two).unwrap();

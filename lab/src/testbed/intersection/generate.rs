@@ -118,7 +118,8 @@ impl<'a> ConfusionModel<'a> {
         frames: usize,
         rng: &mut ChaCha8Rng,
     ) -> Vec<Vec<Detection>> {
-        let (camera, pose) = (&scene.intrinsics, &scene.cavs[cav].pose);
+        let camera = &scene.intrinsics;
+        let pose = &scene.cavs[cav].pose;
         let mut chosen = Vec::new();
         for (object, views) in scene.objects.iter().zip(&self.views) {
             chosen.extend(sight(camera, pose, object).zip(views.choose(rng)));
@@ -189,10 +190,8 @@ impl Glimpse {
         let scale = self.forward_m / forward_m;
         let x = camera.cx - camera.fx * (bearing_rad + self.bearing_error_rad).tan();
         let y = camera.cy + (recorded.center().y - camera.cy) * scale;
-        let (half_width, half_height) = (
-            recorded.width() * scale / 2.0,
-            recorded.height() * scale / 2.0,
-        );
+        let half_width = recorded.width() * scale / 2.0;
+        let half_height = recorded.height() * scale / 2.0;
         let bounding_box = BoundingBox {
             x_min: x - half_width,
             y_min: (y - half_height).max(0.0),

@@ -7,7 +7,8 @@ use super::*;
 #[test]
 fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_forgotten() {
     for has_led in [false, true] {
-        let (mut edge, mut euclid) = (signing("edge", 7, "edge"), signing("other", 8, "gauss"));
+        let mut edge = signing("edge", 7, "edge");
+        let mut euclid = signing("other", 8, "gauss");
         edge.lead(7);
         edge.leadership.position = Position::Leading;
         if has_led {
@@ -81,7 +82,8 @@ fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
 /// on nodes that had dropped it.
 #[test]
 fn a_short_leadership_counts_at_once_where_it_was_handed_on_and_later_at_all() {
-    let (mut edge, mut hopper) = (signing("edge", 8, "gauss"), signing("other", 8, "gauss"));
+    let mut edge = signing("edge", 8, "gauss");
+    let mut hopper = signing("other", 8, "gauss");
     let mut gauss = signing("gauss", 8, "gauss");
     gauss.lead(8);
     let said = sign(gauss.record(8, "euclid"));
@@ -95,7 +97,8 @@ fn a_short_leadership_counts_at_once_where_it_was_handed_on_and_later_at_all() {
         position: Position::Leading,
         ..following(9, "edge")
     };
-    (hopper.leadership, gauss.leadership) = (following(9, "edge"), following(9, "edge"));
+    hopper.leadership = following(9, "edge");
+    gauss.leadership = following(9, "edge");
     assert_eq!(edge.vehicles(), ["euclid"], "it goes on from there");
     assert_eq!(hopper.vehicles(), ["euclid"]);
     for at_s in (5..=40).step_by(5) {

@@ -15,7 +15,8 @@ fn camera() -> Intrinsics {
 }
 
 fn mounted(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     Mount {
         height_m: Some(height_m),
         pitch_rad,
@@ -33,7 +34,8 @@ impl Dice {
     }
 
     fn normal(&mut self, mean: f64, sigma: f64) -> f64 {
-        let (u, v): (f64, f64) = (self.0.random(), self.0.random());
+        let u: f64 = self.0.random();
+        let v: f64 = self.0.random();
         mean + sigma * (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
     }
 
@@ -90,16 +92,15 @@ fn minute(mount: &Mount, reach_m: f64, seed: u64) -> Vec<Vec<BoundingBox>> {
     let to_camera = mount.to_level().transpose();
     let mut frames = vec![Vec::new(); 300];
     for person in 0..15 {
-        let (height_m, heading_rad) = (dice.body_height(), dice.between(0.0, TAU));
+        let height_m = dice.body_height();
+        let heading_rad = dice.between(0.0, TAU);
         let middle = Point2::new(
             dice.between(0.25, 0.8) * reach_m,
             dice.between(-0.3, 0.3) * reach_m,
         );
         for frame in 0..60 {
-            let (ahead_m, step_m) = (
-                f64::from(frame - 30) * 0.26,
-                0.7 * f64::sin(f64::from(frame) * 1.3).abs(),
-            );
+            let ahead_m = f64::from(frame - 30) * 0.26;
+            let step_m = 0.7 * f64::sin(f64::from(frame) * 1.3).abs();
             let at = middle + Rotation2::new(heading_rad) * Vector2::new(ahead_m, 0.0);
             let to_pixel = |point: Point3<f64>| {
                 camera().project(&Point3::from(
@@ -174,10 +175,8 @@ fn a_minute_of_walking_people_gives_pitch_within_a_degree_and_height_within_eigh
                 failures.push(format!("{real:?}: {found:?}"));
                 continue;
             };
-            let (pitch_off_deg, roll_off_deg) = (
-                (mount.pitch_rad - real.pitch_rad).to_degrees(),
-                (mount.roll_rad - real.roll_rad).to_degrees(),
-            );
+            let pitch_off_deg = (mount.pitch_rad - real.pitch_rad).to_degrees();
+            let roll_off_deg = (mount.roll_rad - real.roll_rad).to_degrees();
             let height_off = mount.height_m.unwrap() / height_m - 1.0;
             println!(
                 "{height_m} m, {pitch_deg}°, {roll_deg}°, {boxes} boxes: pitch {pitch_off_deg:+.2}° ± {:.2}°, roll {roll_off_deg:+.2}° \

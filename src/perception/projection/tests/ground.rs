@@ -21,7 +21,8 @@ fn camera() -> Intrinsics {
 }
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     Mount {
         height_m: Some(height_m),
         pitch_rad,
@@ -85,11 +86,10 @@ fn seen(
     yaw_rad: f64,
     mount: &Mount,
 ) -> Option<Detection> {
-    let (half_width, half_length) = (
-        size.width_m / 2.0,
-        size.length_m.unwrap_or(size.width_m) / 2.0,
-    );
-    let (turn, to_camera) = (Rotation2::new(yaw_rad), mount.to_level().transpose());
+    let half_width = size.width_m / 2.0;
+    let half_length = size.length_m.unwrap_or(size.width_m) / 2.0;
+    let turn = Rotation2::new(yaw_rad);
+    let to_camera = mount.to_level().transpose();
     let mut corners = Vec::new();
     for (along, across) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         let on_ground = at + turn * Vector2::new(along * half_length, across * half_width);
@@ -155,7 +155,8 @@ impl Street {
     }
 
     fn normal(&mut self) -> f64 {
-        let (u, v): (f64, f64) = (self.dice.random(), self.dice.random());
+        let u: f64 = self.dice.random();
+        let v: f64 = self.dice.random();
         (-2.0 * (1.0 - u).ln()).sqrt() * (2.0 * PI * v).cos()
     }
 
@@ -204,8 +205,8 @@ fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_heigh
     {
         for pitch_deg in PITCHES_DEG {
             for roll_deg in [0.0, 6.0] {
-                let (mount, mut street) =
-                    (mount(height_m, pitch_deg, roll_deg), Street::new(height_m));
+                let mount = mount(height_m, pitch_deg, roll_deg);
+                let mut street = Street::new(height_m);
                 let config = ProjectionConfig {
                     pixel_sigma_px: 0.5,
                     tilt_sigma_rad: 1e-4,
@@ -253,7 +254,8 @@ fn coverage(
         ..ProjectionConfig::default()
     };
     let projection = projection(ranging, stated, &config);
-    let (mut covered, mut all) = (0, 0);
+    let mut covered = 0;
+    let mut all = 0;
     for _ in 0..3000 {
         let mut off = |sigma: f64| sigma * street.normal();
         let mut real = stated;
@@ -514,7 +516,8 @@ fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
             ..ProjectionConfig::default()
         },
     );
-    let (mut check, mut told) = (MountCheck::default(), None);
+    let mut check = MountCheck::default();
+    let mut told = None;
     for half_seconds in 0..120 {
         let (mut detection, _) = street.next(mounted, 1.0, 10.0);
         detection.bounding_box.y_max += 2.0 * street.normal();
@@ -552,8 +555,11 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
 
 #[test]
 fn a_camera_that_has_turned_is_told_in_a_crowd_too() {
-    let (mounted, said) = (mount(1.5, -6.0, 0.0), mount(1.5, 0.0, 0.0));
-    let (mut street, mut check, mut told) = (Street::new(1.5), MountCheck::default(), None);
+    let mounted = mount(1.5, -6.0, 0.0);
+    let said = mount(1.5, 0.0, 0.0);
+    let mut street = Street::new(1.5);
+    let mut check = MountCheck::default();
+    let mut told = None;
     let projection = projection(Ranging::Auto, said, &ProjectionConfig::default());
     for half_seconds in 0..40 {
         let crowd: Vec<_> = (0..20)

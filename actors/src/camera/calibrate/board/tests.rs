@@ -48,7 +48,8 @@ fn flat(side: i32, is_dark: impl Fn(i32, i32) -> bool) -> Mat {
 
 fn code(text: &str) -> (Mat, f64) {
     let code = QrCode::new(text).unwrap();
-    let (side, modules) = (code.width() as i32, code.to_colors());
+    let side = code.width() as i32;
+    let modules = code.to_colors();
     (
         flat(side, |row, column| {
             modules[(row * side + column) as usize] == Color::Dark
@@ -85,7 +86,8 @@ fn photograph(
         .collect();
     let to_image = calib3d::find_homography_def(&drawn, &seen, &mut Mat::default()).unwrap();
     let mut image = Mat::default();
-    let (size, ground) = (Size::new(1280, 720), Scalar::all(120.0));
+    let size = Size::new(1280, 720);
+    let ground = Scalar::all(120.0);
     imgproc::warp_perspective(
         drawing,
         &mut image,
@@ -102,7 +104,8 @@ fn photograph(
 }
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     Mount {
         height_m: Some(height_m),
         pitch_rad,
@@ -185,8 +188,10 @@ fn a_photograph_without_the_board_or_with_two_is_told_so() {
         .unwrap_err()
         .to_string();
     assert!(none.contains("no QR code was found"), "{none}");
-    let ((left, modules), (right, _)) = (code("left"), code("rite"));
-    let (mut row, mut both) = (Mat::default(), Mat::default());
+    let (left, modules) = code("left");
+    let (right, _) = code("rite");
+    let mut row = Mat::default();
+    let mut both = Mat::default();
     hconcat(&Vector::<Mat>::from_iter([left, right]), &mut row).unwrap();
     let white =
         Mat::new_size_with_default(row.size().unwrap(), CV_8UC1, Scalar::all(235.0)).unwrap();

@@ -5,7 +5,8 @@ fn camera() -> Intrinsics {
 }
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
-    let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
+    let pitch_rad = pitch_deg.to_radians();
+    let roll_rad = roll_deg.to_radians();
     Mount {
         height_m: Some(height_m),
         pitch_rad,
@@ -77,10 +78,8 @@ fn a_camera_is_found_from_four_points_whatever_its_height_and_tilt() {
         (6.0, 30.0, 6.0, -0.1),
         (1.0, -3.0, 2.0, 0.05),
     ] {
-        let (pose, real) = (
-            Pose::new(0.4, -0.2, heading),
-            mount(height_m, pitch_deg, roll_deg),
-        );
+        let pose = Pose::new(0.4, -0.2, heading);
+        let real = mount(height_m, pitch_deg, roll_deg);
         let fit = fit_ground_points(&seen(&PLACES[2..6], &EXACT, &pose, &real), &camera()).unwrap();
         is_near(&fit, &pose, &real, 0.01, 0.01);
     }
@@ -88,7 +87,8 @@ fn a_camera_is_found_from_four_points_whatever_its_height_and_tilt() {
 
 #[test]
 fn a_wrong_point_is_named_and_costs_nothing() {
-    let (pose, real) = (Pose::new(0.4, -0.2, 0.1), mount(2.5, 12.0, -4.0));
+    let pose = Pose::new(0.4, -0.2, 0.1);
+    let real = mount(2.5, 12.0, -4.0);
     let mut off_px = [
         (1.0, -0.5),
         (-0.7, 0.4),
@@ -133,7 +133,8 @@ fn a_wrong_point_is_named_and_costs_nothing() {
 
 #[test]
 fn what_gives_no_camera_is_told_with_the_remedy() {
-    let (pose, real) = (Pose::new(0.0, 0.0, 0.0), mount(2.5, 12.0, 0.0));
+    let pose = Pose::new(0.0, 0.0, 0.0);
+    let real = mount(2.5, 12.0, 0.0);
     let points = seen(&PLACES, &EXACT, &pose, &real);
     let error = |points: &[GroundPoint]| {
         fit_ground_points(points, &camera())

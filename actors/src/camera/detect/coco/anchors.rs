@@ -20,14 +20,10 @@ impl Anchor {
     /// The box for the network's four outputs ty, tx, th, tw.
     pub(super) fn decode(&self, offsets: &[f32]) -> BoundingBox {
         let [ty, tx, th, tw] = std::array::from_fn(|i| f64::from(offsets[i]));
-        let (center_x, center_y) = (
-            self.center_x + tx / 10.0 * self.width,
-            self.center_y + ty / 10.0 * self.height,
-        );
-        let (half_width, half_height) = (
-            self.width * (tw / 5.0).exp() / 2.0,
-            self.height * (th / 5.0).exp() / 2.0,
-        );
+        let center_x = self.center_x + tx / 10.0 * self.width;
+        let center_y = self.center_y + ty / 10.0 * self.height;
+        let half_width = self.width * (tw / 5.0).exp() / 2.0;
+        let half_height = self.height * (th / 5.0).exp() / 2.0;
         BoundingBox {
             x_min: center_x - half_width,
             y_min: center_y - half_height,

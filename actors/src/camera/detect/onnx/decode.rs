@@ -51,10 +51,8 @@ impl Head {
                 .and_then(|o| o.shape.last())
                 .map_or(1, |last| (*last).max(1))
         };
-        let (pixels, shares) = (
-            (1.0, 1.0),
-            (f64::from(input.width), f64::from(input.height)),
-        );
+        let pixels = (1.0, 1.0);
+        let shares = (f64::from(input.width), f64::from(input.height));
         let best = |scores: &[f32]| {
             scores
                 .iter()
@@ -93,7 +91,8 @@ impl Head {
                 })
                 .collect(),
             Layout::Columns(output) => {
-                let (values, count) = (values(output), width(output));
+                let values = values(output);
+                let count = width(output);
                 let row = |index: usize| {
                     values
                         .chunks_exact(count)
@@ -176,7 +175,8 @@ fn four(row: &[f32]) -> Option<[f32; 4]> {
 /// Column, line and stride in pixels of every cell of the grids, in the order of YOLOX.
 fn cells(input: ImageSize) -> impl Iterator<Item = (f32, f32, f64)> {
     STRIDES.into_iter().flat_map(move |stride| {
-        let (columns, lines) = (input.width / stride, input.height / stride);
+        let columns = input.width / stride;
+        let lines = input.height / stride;
         (0..lines).flat_map(move |line| {
             (0..columns).map(move |column| (column as f32, line as f32, f64::from(stride)))
         })

@@ -211,7 +211,8 @@ impl Head {
                 false
             }
         };
-        let (width, height) = (f64::from(input.width), f64::from(input.height));
+        let width = f64::from(input.width);
+        let height = f64::from(input.height);
         let largest = x_max.max(y_max);
         if are_pixels && largest <= MAX_SHARE && largest > 0.0 {
             let what = "is within the first pixel, as shares of the image would be";

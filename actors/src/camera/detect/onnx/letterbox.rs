@@ -38,10 +38,8 @@ impl Letterbox {
     /// The place of an image.
     pub(super) fn new(fit: Fit, image: ImageSize, input: ImageSize) -> Self {
         let [image_width, image_height] = [image.width, image.height].map(f64::from);
-        let (most_x, most_y) = (
-            f64::from(input.width) / image_width,
-            f64::from(input.height) / image_height,
-        );
+        let most_x = f64::from(input.width) / image_width;
+        let most_y = f64::from(input.height) / image_height;
         let (scale_x, scale_y) = match fit {
             Fit::Stretched => (most_x, most_y),
             Fit::Centred | Fit::TopLeft => (most_x.min(most_y), most_x.min(most_y)),
@@ -55,19 +53,15 @@ impl Letterbox {
             }
         };
         let side = |length: f64, most: u32| (whole(length) as u32).clamp(1, most);
-        let (width, height) = (
-            side(image_width * scale_x, input.width),
-            side(image_height * scale_y, input.height),
-        );
+        let width = side(image_width * scale_x, input.width);
+        let height = side(image_height * scale_y, input.height);
         let (left, top) = match fit {
             // An odd pixel goes to the right and below, as in Ultralytics' `LetterBox`.
             Fit::Centred => ((input.width - width) / 2, (input.height - height) / 2),
             Fit::TopLeft | Fit::Stretched => (0, 0),
         };
-        let (scale_x, scale_y) = (
-            f64::from(width) / image_width,
-            f64::from(height) / image_height,
-        );
+        let scale_x = f64::from(width) / image_width;
+        let scale_y = f64::from(height) / image_height;
         Self {
             input,
             left,
@@ -80,7 +74,8 @@ impl Letterbox {
 
     /// A box of the input in pixels of the image.
     pub(super) fn to_image(self, b: &BoundingBox) -> BoundingBox {
-        let (left, top) = (f64::from(self.left), f64::from(self.top));
+        let left = f64::from(self.left);
+        let top = f64::from(self.top);
         BoundingBox {
             x_min: (b.x_min - left) / self.scale_x,
             y_min: (b.y_min - top) / self.scale_y,

@@ -50,7 +50,8 @@ impl Scene {
 
     fn warp(&mut self, flat: &Mat, modules: f64, corners: &[Point2<f64>; 4]) {
         let point = |x: f64, y: f64| Point2f::new((x - 0.5) as f32, (y - 0.5) as f32);
-        let (low, high) = (4.0 * MODULE, (4.0 + modules) * MODULE);
+        let low = 4.0 * MODULE;
+        let high = (4.0 + modules) * MODULE;
         let from: Vector<Point2f> = [(low, low), (high, low), (high, high), (low, high)]
             .into_iter()
             .map(|(x, y)| point(x, y))
@@ -61,7 +62,8 @@ impl Scene {
             .collect();
         let warp = imgproc::get_perspective_transform_def(&from, &to).unwrap();
         let size = self.0.size().unwrap();
-        let (area, transparent) = (imgproc::INTER_AREA, BORDER_TRANSPARENT);
+        let area = imgproc::INTER_AREA;
+        let transparent = BORDER_TRANSPARENT;
         imgproc::warp_perspective(
             flat,
             &mut self.0,
@@ -77,7 +79,9 @@ impl Scene {
     /// The picture that a camera takes of the scene: blur of 0.7 and noise of 5 gray levels, both
     /// standard deviations.
     fn seen(&self) -> CameraFrame {
-        let (mut small, mut blurred, mut image) = (Mat::default(), Mat::default(), Mat::default());
+        let mut small = Mat::default();
+        let mut blurred = Mat::default();
+        let mut image = Mat::default();
         let size = Size::new(640, 480);
         imgproc::resize(&self.0, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA).unwrap();
         imgproc::gaussian_blur_def(&small, &mut blurred, Size::default(), 0.7).unwrap();
@@ -94,7 +98,8 @@ impl Scene {
 const MODULE: f64 = 16.0;
 
 fn flat(code: &QrCode) -> Mat {
-    let (modules, module) = (code.width() as i32, MODULE as i32);
+    let modules = code.width() as i32;
+    let module = MODULE as i32;
     let side = (modules + 8) * module;
     let mut flat =
         Mat::new_rows_cols_with_default(side, side, CV_8UC1, Scalar::all(230.0)).unwrap();

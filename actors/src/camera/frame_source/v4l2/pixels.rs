@@ -89,7 +89,8 @@ impl FrameLayout {
     /// The layout of the format that the driver has chosen, which may have another size than
     /// requested.
     pub(super) fn new(conversion: PixelConversion, chosen: &PixFormat) -> Result<Self, String> {
-        let (got, wanted) = (chosen.pixel_format(), conversion.format());
+        let got = chosen.pixel_format();
+        let wanted = conversion.format();
         if got != wanted {
             return Err(format!(
                 "it has the format {wanted} and gives {got}: another program may use it"
@@ -109,15 +110,13 @@ impl FrameLayout {
             )
         };
         let [width, height] = [width, height].map(|side| i32::try_from(side).map_err(|_| unfit()));
-        let (layout, pixel) = (
-            Self {
-                way,
-                width: width?,
-                height: height?,
-                stride: 0,
-            },
-            way.bytes_of_pixel(),
-        );
+        let layout = Self {
+            way,
+            width: width?,
+            height: height?,
+            stride: 0,
+        };
+        let pixel = way.bytes_of_pixel();
         let row = layout.width as usize * pixel;
         let stride = if bytes_per_line == 0 {
             row

@@ -200,7 +200,8 @@ impl Presentation {
 
     /// The image with square pixels and upright.
     fn apply(self, mut image: Mat) -> opencv::Result<Mat> {
-        let (width, height) = (f64::from(image.cols()), f64::from(image.rows()));
+        let width = f64::from(image.cols());
+        let height = f64::from(image.rows());
         // The shorter side of the pixels is enlarged, so that no detail is lost.
         let size = Size::new(
             (width * self.pixel_aspect.max(1.0)).round() as i32,

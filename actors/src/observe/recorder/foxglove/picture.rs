@@ -118,7 +118,10 @@ impl CameraCalibration {
     /// The optics of a picture; `None` if there are no optics for its shape.
     pub(crate) fn of(picture: &CapturedPicture) -> Option<Self> {
         let (camera, distortion) = picture.optics?;
-        let (fx, fy, cx, cy) = (camera.fx, camera.fy, camera.cx, camera.cy);
+        let fx = camera.fx;
+        let fy = camera.fy;
+        let cx = camera.cx;
+        let cy = camera.cy;
         let coefficients = distortion.unwrap_or_default();
         let (polynomial, denominator) = coefficients.split_at(5);
         let is_rational = denominator.iter().any(|k| *k != 0.0);
@@ -147,7 +150,8 @@ impl CameraCalibration {
 impl ImageAnnotations {
     /// A box for each detection, and its label and confidence above.
     pub(crate) fn of(picture: &CapturedPicture) -> Self {
-        let (timestamp, rows) = (Time::from(picture.captured_at), f64::from(picture.height));
+        let timestamp = Time::from(picture.captured_at);
+        let rows = f64::from(picture.height);
         let outline = |detection: &Detection| {
             let b = &detection.bounding_box;
             let corners = [
@@ -178,10 +182,8 @@ impl ImageAnnotations {
             background_color: SHADE,
         };
         let detections = &picture.detections;
-        let (points, texts) = (
-            detections.iter().map(outline).collect(),
-            detections.iter().map(text).collect(),
-        );
+        let points = detections.iter().map(outline).collect();
+        let texts = detections.iter().map(text).collect();
         Self {
             circles: [],
             points,

@@ -283,7 +283,8 @@ impl SceneStyle {
 
     /// A vehicle and its detections.
     pub(crate) fn report(&self, report: &ObjectReport) -> SceneUpdate {
-        let (at, node) = (report.captured_at_us, &report.node);
+        let at = report.captured_at_us;
+        let node = &report.node;
         let vehicle = report.pose.map(|pose| self.vehicle_entity(node, &pose, at));
         let objects = report.objects.iter().enumerate().map(|(number, object)| {
             let entity = SceneEntity::new(at, format!("detection/{node}/{number}"))
@@ -414,7 +415,8 @@ impl SceneEntity {
         let [x, y] = [eigenvalues[0], eigenvalues[1]]
             .map(|variance| 2.0 * SIGMAS_95 * variance.max(0.0).sqrt());
         let pose = plane_pose(x_m, y_m, axis.y.atan2(axis.x));
-        let (size, color) = (Vector3 { x, y, z: 0.01 }, Color { a: 0.2, ..color });
+        let size = Vector3 { x, y, z: 0.01 };
+        let color = Color { a: 0.2, ..color };
         self.cylinders.push(Cylinder {
             pose,
             size,
@@ -462,7 +464,8 @@ impl SceneEntity {
             z: pose.position.z + above_m,
             ..pose.position
         };
-        let (pose, font_size) = (FoxglovePose { position, ..pose }, TEXT_PX);
+        let pose = FoxglovePose { position, ..pose };
+        let font_size = TEXT_PX;
         let color = Color {
             a: opacity,
             ..TEXT_COLOR
@@ -529,7 +532,8 @@ mod tests {
         );
         let Cylinder { pose, size, .. } = &entity.cylinders[0];
         assert_eq!((pose.position.x, pose.position.y), (3.0, 4.0));
-        let (long, short) = (size.x.max(size.y), size.x.min(size.y));
+        let long = size.x.max(size.y);
+        let short = size.x.min(size.y);
         assert!(
             (long - 4.0 * SIGMAS_95).abs() < 1e-9 && (short - SIGMAS_95).abs() < 1e-9,
             "{size:?}"

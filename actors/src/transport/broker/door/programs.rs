@@ -267,7 +267,8 @@ impl DoorState {
     }
 
     fn is_nodeless_name(&self, principal: &Principal, name: &NodeName) -> bool {
-        let (setup, vehicle) = (&self.setup, name.vehicle());
+        let setup = &self.setup;
+        let vehicle = name.vehicle();
         principal.identity.is_none()
             && vehicle != setup.node
             && setup.serves_nodes
@@ -349,7 +350,8 @@ impl DoorState {
         if throttle.is_none_or(|throttle| lock(throttle).allow(now)) {
             return Ok(());
         }
-        let (node, most) = (&self.setup.node, self.setup.max_report_hz / 2);
+        let node = &self.setup.node;
+        let most = self.setup.max_report_hz / 2;
         let text = format!(
             "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz"
         );

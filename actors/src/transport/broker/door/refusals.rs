@@ -115,7 +115,9 @@ impl Refusals {
         };
         let (refused, at) = self.known.entry(key).or_insert_with(|| (empty(), now));
         refused.times += 1;
-        (refused.topic, refused.text, *at) = (topic.to_owned(), refusal.text.clone(), now);
+        refused.topic = topic.to_owned();
+        refused.text = refusal.text.clone();
+        *at = now;
         if !(is_first && has_room)
             && self
                 .shown_at
@@ -143,10 +145,8 @@ mod tests {
     use super::*;
 
     fn shown(refusals: &mut Refusals, client: &str, at_s: u64) -> Option<Vec<String>> {
-        let (node, refusal) = (
-            NodeName::from_static("euclid"),
-            DoorRefusal::not_permitted("no"),
-        );
+        let node = NodeName::from_static("euclid");
+        let refusal = DoorRefusal::not_permitted("no");
         let status = refusals.note(
             &node,
             (client, "detections/gauss"),

@@ -90,7 +90,8 @@ impl Cell {
         let mut session = SessionNonce::default();
         self.rng.fill(&mut session);
         let cell = NodeName::from_static("lot-1");
-        let (key, seed) = (CellKey::new(key, &cell), self.rng.random());
+        let key = CellKey::new(key, &cell);
+        let seed = self.rng.random();
         let setup = GossipSetup {
             own,
             cell,
@@ -116,7 +117,8 @@ impl Cell {
     fn run(&mut self, ms: u64) {
         for _ in 0..ms {
             self.now = self.now + Duration::from_millis(1);
-            let (now, arrived): (_, Vec<_>) = (self.now, self.take_arrived());
+            let now = self.now;
+            let arrived: Vec<_> = self.take_arrived();
             for (_, from, to, frame) in arrived {
                 let Some(node) = self.nodes.get_mut(&index(to)) else {
                     continue;
@@ -455,7 +457,8 @@ fn two_taken_names_are_reported_beside_each_other() {
 /// Asserts that node 9 has given up the name of node 1, that only node 9 was informed, and that
 /// node 1 has reported it.
 fn assert_second_gave_up(cell: &Cell) {
-    let (first, second) = (&cell.nodes[&1], &cell.nodes[&9]);
+    let first = &cell.nodes[&1];
+    let second = &cell.nodes[&9];
     assert!(
         second.events.contains(&MembershipEvent::Excluded),
         "{:?}",
@@ -586,7 +589,8 @@ fn nothing_is_sent_to_one_that_went_out_of_range_long_ago() {
     cell.nodes.remove(&2);
     for (wait_ms, left_out) in [(2000, 0), (10_000, 1)] {
         cell.run(wait_ms);
-        let (now, machine) = (cell.now, &mut cell.nodes.get_mut(&1).unwrap().machine);
+        let now = cell.now;
+        let machine = &mut cell.nodes.get_mut(&1).unwrap().machine;
         machine.send(&node_name(2), b"beat", now);
         assert_eq!(
             machine.counters.get(FrameEvent::NoSession),

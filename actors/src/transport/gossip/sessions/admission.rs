@@ -415,7 +415,8 @@ impl Sessions {
         admission: Admission,
         arrival: &Arrival<'_>,
     ) -> Result<NameClaim, FrameEvent> {
-        let (address, now) = (arrival.from, arrival.now);
+        let address = arrival.from;
+        let now = arrival.now;
         let claim = self.claim(head, id, arrival);
         let Admission {
             proven,
@@ -429,7 +430,8 @@ impl Sessions {
                 None => peer.keys.skip_to(head.counter),
             }
             if proven.is_some() {
-                (peer.id, peer.proven) = (id.clone(), proven);
+                peer.id = id.clone();
+                peer.proven = proven;
             }
             peer.note_heard(now);
             if is_proof {

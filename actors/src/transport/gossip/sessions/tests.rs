@@ -138,7 +138,8 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
 
 #[test]
 fn introduced_nodes_understand_each_other_once() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
     let (to, frame) = a
         .sessions
@@ -177,7 +178,8 @@ fn forge(key: &CellKey, sender: &SessionId, receiver: &SessionId, counter: u64) 
 
 #[test]
 fn a_counter_from_beyond_mutes_nobody() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
     for counter in [u64::MAX, u64::MAX - 1, 1 << 53, 1 << 22] {
         let frame = forge(&a.sessions.key, &[1; 16], &[2; 16], counter);
@@ -195,7 +197,8 @@ fn a_counter_from_beyond_mutes_nobody() {
 
 #[test]
 fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
     let mut thief = End::new("a", 1);
     thief.address = SocketAddr::from(([10, 0, 0, 9], 1));
@@ -207,7 +210,8 @@ fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
         b.open(&proof, thief.address, now)
     };
     assert_eq!(take_over(&mut b, NOW), Err(FrameEvent::Replayed));
-    let (frame, heard) = (a.seal(&b.id.name, b"hi"), payload(&a, b"hi"));
+    let frame = a.seal(&b.id.name, b"hi");
+    let heard = payload(&a, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
     let later = NOW + Duration::from_secs(1);
     assert!(
@@ -218,14 +222,13 @@ fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
 
 #[test]
 fn a_member_that_floods_is_not_heard_for_long() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
     let mut taken_in_a_second = |second: u64| {
         let mut is_taken = |n: u64| {
-            let (frame, now) = (
-                a.seal(&b.id.name, b"?"),
-                NOW + Duration::from_micros(1_000_000 * second + 100 * n),
-            );
+            let frame = a.seal(&b.id.name, b"?");
+            let now = NOW + Duration::from_micros(1_000_000 * second + 100 * n);
             b.open(&frame, a.address, now).is_ok()
         };
         (0..10_000).filter(|n| is_taken(*n)).count()
@@ -236,7 +239,8 @@ fn a_member_that_floods_is_not_heard_for_long() {
 
 #[test]
 fn recorded_handshakes_admit_nobody() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     let [hello, challenge, proof, accept] = introduce(&mut a, &mut b);
     for frame in [&proof, &challenge, &accept] {
         for end in [&mut a, &mut b] {
@@ -263,7 +267,8 @@ fn recorded_handshakes_admit_nobody() {
 
 #[test]
 fn a_proof_from_elsewhere_or_too_late_is_none() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     let hello = a.hello();
     let challenge = answer(b.open(&hello, a.address, NOW));
     let proof = answer(a.open(&challenge, b.address, NOW));
@@ -278,7 +283,8 @@ fn a_proof_from_elsewhere_or_too_late_is_none() {
 
 #[test]
 fn frames_of_strangers_cause_a_greeting_and_count() {
-    let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+    let mut a = End::new("a", 1);
+    let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
     let frame = a.seal(&b.id.name, b"news");
     b.sessions.peers.clear();
@@ -327,7 +333,8 @@ proptest! {
     /// Bodies that a holder of the key encoded incorrectly.
     #[test]
     fn sealed_junk_changes_nothing(kind in 1u8..=4, body in prop::collection::vec(any::<u8>(), 0..200)) {
-        let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
+        let mut a = End::new("a", 1);
+        let mut b = End::new("b", 2);
         introduce(&mut a, &mut b);
         let kind = [FrameKind::Hello, FrameKind::Handshake, FrameKind::Gossip, FrameKind::Payload][usize::from(kind) - 1];
         let head = a.sessions.head(kind);
@@ -351,7 +358,8 @@ fn another_key_and_a_misspelt_cell_are_named() {
             alive: true,
         });
         let mut stranger = End::of_cell(other, "gauss", 7, None);
-        let (greeting, from) = (stranger.hello(), stranger.address);
+        let greeting = stranger.hello();
+        let from = stranger.address;
         assert!(node.open(&greeting, from, NOW).is_err());
         let notices = node.sessions.take_notices();
         notices

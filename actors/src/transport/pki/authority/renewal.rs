@@ -86,7 +86,8 @@ impl Authority {
         now: Timestamp,
     ) -> Result<String, RenewalRefusal> {
         let subject = self.issued_to(certificate)?;
-        let (name, rights) = (subject.name(), subject.rights());
+        let name = subject.name();
+        let rights = subject.rights();
         let (renewed, _) = self.certify(name, rights, validity(&subject), now, key)?;
         Ok(renewed)
     }
@@ -154,13 +155,15 @@ mod tests {
 
     #[test]
     fn a_renewed_certificate_has_the_same_name_rights_and_duration_and_another_key() {
-        let (directory, now) = (tempfile::tempdir().unwrap(), clock::wall());
+        let directory = tempfile::tempdir().unwrap();
+        let now = clock::wall();
         let mut authority = authority(directory.path());
         for valid in [Duration::from_secs(180), 90 * DAY, 365 * DAY] {
             let before = issue(&mut authority, valid, now - valid * 19 / 20);
             let key = KeyPair::generate().unwrap();
             let renewed = authority.renew(&before, &key, now).unwrap();
-            let (renewed, before) = (subject(&renewed), CertificateSubject::of(&before).unwrap());
+            let renewed = subject(&renewed);
+            let before = CertificateSubject::of(&before).unwrap();
             assert_eq!(renewed.name(), before.name());
             assert_eq!(renewed.rights(), before.rights());
             let whole = |it: &CertificateSubject| it.expires().since(it.begins()).as_secs();
@@ -173,7 +176,8 @@ mod tests {
     #[test]
     fn only_a_valid_certificate_of_this_ca_that_ends_soon_is_renewed_and_not_often() {
         let [directory, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
-        let (mut authority, now) = (authority(directory.path()), clock::wall());
+        let mut authority = authority(directory.path());
+        let now = clock::wall();
         let key = KeyPair::generate().unwrap();
         let renew = |certificate: &[u8], authority: &mut Authority| {
             authority.renew(certificate, &key, now).map(drop)

@@ -43,7 +43,8 @@ pub(super) fn authorities_of(
         .transpose()?;
     let own = own.unwrap_or_default();
     let of_city = authorities("tls.city.ca", &city.ca)?;
-    let (mut of_cell, mut revoked) = (Vec::new(), Vec::new());
+    let mut of_cell = Vec::new();
+    let mut revoked = Vec::new();
     for certificate in authorities("tls.ca", cell)? {
         let Some(signed_by) = of_city
             .iter()

@@ -28,7 +28,8 @@ impl Credentials {
         public_key: &[u8],
         secret: &str,
     ) -> Result<(), CredentialsError> {
-        let (files, current) = (&self.files, self.current());
+        let files = &self.files;
+        let current = self.current();
         let unfit = |reason: &dyn std::fmt::Display| {
             CredentialsError::Unusable(format!("the new certificate cannot be used: {reason}"))
         };
@@ -117,11 +118,13 @@ mod tests {
             _directory,
         } = machine();
         let read = |path: &Path| fs::read_to_string(path).unwrap();
-        let (old, old_key) = (read(&files.certificate), read(&files.key));
+        let old = read(&files.certificate);
+        let old_key = read(&files.key);
         let credentials = Credentials::load(&files, &EUCLID).unwrap();
         let new_key = NewKey::generate().unwrap();
         new_key.reissue(&mut authority, &credentials).unwrap();
-        let (new, key) = (read(&files.certificate), read(&files.key));
+        let new = read(&files.certificate);
+        let key = read(&files.key);
         assert!(new != old && key != old_key && !key.contains(&old_key));
         let both = format!("{old_key}\n{key}");
         for (certificate, key) in [(&old, &both), (&new, &both), (&new, &key)] {

@@ -82,9 +82,11 @@ impl Series {
             return None;
         }
         let third = self.0.len() / 3;
-        let (middle, last) = (&self.0[third..2 * third], &self.0[self.0.len() - third..]);
+        let middle = &self.0[third..2 * third];
+        let last = &self.0[self.0.len() - third..];
         let grows = |what: &str, of: fn(&Resources) -> u64| {
-            let (before, after) = (median(middle, of), median(last, of));
+            let before = median(middle, of);
+            let after = median(last, of);
             (after > before + before / 10 + of(&ALLOWED))
                 .then(|| format!("{what} {before} to {after}"))
         };

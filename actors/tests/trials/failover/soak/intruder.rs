@@ -91,7 +91,8 @@ impl Intruder {
         let mut ticks = interval(JUNK_TICK);
         while Instant::now() < until {
             ticks.tick().await;
-            let (payload, bytes) = (self.junk()?, self.bytes(1200));
+            let payload = self.junk()?;
+            let bytes = self.bytes(1200);
             let node = self.rng.random_range(0..clients.len());
             let kind =
                 ["detections", "vote_detections", "nodes", "ledger"][self.rng.random_range(0..4)];
@@ -132,7 +133,8 @@ impl Intruder {
                 .replace("0.9", "-1e999")
                 .into_bytes(),
             _ => {
-                let (term, now) = (self.rng.next_u64() >> 12, clock::now().micros());
+                let term = self.rng.next_u64() >> 12;
+                let now = clock::now().micros();
                 let map = format!(
                     r#"{{"schema":1,"aggregator":"{NAME}","epoch":{term},"round":1,"fused_at_us":{now},"landmarks":[],"objects":[]}}"#
                 );

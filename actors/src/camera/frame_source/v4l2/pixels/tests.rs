@@ -43,7 +43,9 @@ fn the_format_that_costs_least_is_chosen() {
 /// Red has brightness 81 and colours 90 and 240 by BT.601, gray 126 and 128 twice.
 #[test]
 fn packed_and_planar_colors_become_bgr() {
-    let (y, u, v) = (81, 90, 240);
+    let y = 81;
+    let u = 90;
+    let v = 240;
     let planes = |chroma: [u8; 4]| [vec![y; 8], chroma.to_vec()].concat();
     let buffers: [(&[u8; 4], Vec<u8>); 6] = [
         (b"YUYV", [y, u, y, v].repeat(4)),
@@ -116,7 +118,8 @@ fn a_part_of_a_frame_is_refused() {
 
 /// Segments of a JPEG file up to its picture data, and the rest.
 fn without_huffman_tables(jpeg: &[u8]) -> Vec<u8> {
-    let (mut bare, mut rest) = (jpeg[..2].to_vec(), &jpeg[2..]);
+    let mut bare = jpeg[..2].to_vec();
+    let mut rest = &jpeg[2..];
     while rest[1] != 0xda {
         let (segment, after) =
             rest.split_at(2 + usize::from(u16::from_be_bytes([rest[2], rest[3]])));

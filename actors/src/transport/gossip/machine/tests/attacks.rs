@@ -119,7 +119,8 @@ proptest! {
         (1..=3).for_each(|node| cell.start(node, &name(node)));
         cell.run(1000);
         cell.forget_events();
-        let (now, node) = (cell.now, cell.nodes.get_mut(&1).unwrap());
+        let now = cell.now;
+        let node = cell.nodes.get_mut(&1).unwrap();
         let members = node.machine.members();
         for (frame, at, bits) in bent {
             let (from, _, mut frame) = frame.get(&cell.recorded).clone();

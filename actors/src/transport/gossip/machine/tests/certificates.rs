@@ -217,7 +217,8 @@ fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
     certified.cell.forget_events();
     let before = certified.machine(1).members();
     for life in [u64::MAX, 1 << 53, certified.cell.now.micros() + 1000] {
-        let (gossip, broker) = (address(9), Some(address(9)));
+        let gossip = address(9);
+        let broker = Some(address(9));
         let lie = NodeId {
             name: node_name(3),
             run: 7,

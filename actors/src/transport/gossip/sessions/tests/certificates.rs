@@ -20,7 +20,8 @@ fn node(authority: &mut TrialAuthority, name: &'static str, session: u8) -> End 
 
 fn two() -> (TrialAuthority, End, End) {
     let mut authority = TrialAuthority::new();
-    let (a, b) = (node(&mut authority, "a", 1), node(&mut authority, "b", 2));
+    let a = node(&mut authority, "a", 1);
+    let b = node(&mut authority, "b", 2);
     (authority, a, b)
 }
 
@@ -92,8 +93,10 @@ fn every_frame_of_the_longest_names_fits_a_datagram() {
         let address = "[2001:db8:aaaa:bbbb:cccc:dddd:eeee:ffff]:65535"
             .parse()
             .unwrap();
-        (end.id.run, end.id.life) = (u64::MAX, 1 << 54);
-        (end.id.gossip, end.id.broker) = (address, Some(address));
+        end.id.run = u64::MAX;
+        end.id.life = 1 << 54;
+        end.id.gossip = address;
+        end.id.broker = Some(address);
         end
     });
     b.known = Some(KnownMember {
@@ -111,7 +114,9 @@ fn every_frame_of_the_longest_names_fits_a_datagram() {
 fn the_cells_key_alone_reads_and_forges_nothing() {
     let (_authority, mut a, mut b) = two();
     introduce(&mut a, &mut b);
-    let (key, own, other) = (cell_key(), a.sessions.own, b.sessions.own);
+    let key = cell_key();
+    let own = a.sessions.own;
+    let other = b.sessions.own;
     let frame = a.seal(&b.id.name, b"hi");
     let (open, sealed) = frame.split_at(HEADER_BYTES);
     let head = FrameHeader::read(&frame, key.tag()).unwrap();
@@ -221,7 +226,8 @@ fn a_repeated_or_altered_proof_disturbs_nothing() {
     let (_authority, mut a, mut b) = two();
     let [_, _, first, _] = introduce(&mut a, &mut b);
     assert_both_heard(&mut a, &mut b);
-    let (receiver, elsewhere) = (b.sessions.own, SocketAddr::from(([10, 0, 0, 9], 1)));
+    let receiver = b.sessions.own;
+    let elsewhere = SocketAddr::from(([10, 0, 0, 9], 1));
     assert_eq!(b.open(&first, a.address, NOW), Err(FrameEvent::Replayed));
     assert_eq!(
         b.open(&first, elsewhere, NOW),
@@ -340,7 +346,8 @@ fn reflected_frames_are_refused() {
 fn two_handshakes_at_once_leave_both_understood() {
     for (a_hears, b_hears) in [(true, true), (true, false), (false, true)] {
         let (_authority, mut a, mut b) = two();
-        let (to_b, to_a) = (proof(&mut a, &mut b), proof(&mut b, &mut a));
+        let to_b = proof(&mut a, &mut b);
+        let to_a = proof(&mut b, &mut a);
         let at = NOW + SLOW;
         let to_a_back = answer(b.open(&to_b, a.address, at));
         let to_b_back = answer(a.open(&to_a, b.address, at));
@@ -359,7 +366,8 @@ fn two_handshakes_at_once_leave_both_understood() {
 /// A holder of the cell's key forges challenges for nearly a second, from invented addresses and
 /// from a node's address.
 fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
-    let (key, receiver) = (cell_key(), to.sessions.own);
+    let key = cell_key();
+    let receiver = to.sessions.own;
     for number in 1..=2000_u64 {
         let head = FrameHeader {
             version: Version::Certificate,

@@ -51,7 +51,8 @@ impl City {
             ca: self.city.ca(),
             revocation_list: Some(self.city.revocation_list()),
         };
-        let (ca, list) = (self.cells[cell].ca(), self.cells[cell].revocation_list());
+        let ca = self.cells[cell].ca();
+        let list = self.cells[cell].revocation_list();
         TlsConfig {
             ca,
             certificate,
@@ -258,7 +259,8 @@ fn authorities_of_one_name_are_told_apart_with_their_lists() {
         .unwrap();
     city.issue(&euclid, Role::Cav, DAY, clock::now()).unwrap();
     cells[0].revoke(&gauss, clock::now()).unwrap();
-    let (ca, list) = (at("ca.pem"), at("revoked.pem"));
+    let ca = at("ca.pem");
+    let list = at("revoked.pem");
     let both = |paths: [PathBuf; 2]| paths.map(|path| fs::read_to_string(path).unwrap()).concat();
     for order in [[0, 1], [1, 0]] {
         fs::write(&ca, both(order.map(|cell: usize| cells[cell].ca()))).unwrap();
@@ -272,7 +274,8 @@ fn authorities_of_one_name_are_told_apart_with_their_lists() {
             ca: city.ca(),
             revocation_list: Some(city.revocation_list()),
         };
-        let (ca, revocation_list) = (ca.clone(), Some(list.clone()));
+        let ca = ca.clone();
+        let revocation_list = Some(list.clone());
         let files = TlsConfig {
             ca,
             certificate: certificate_file,
