@@ -149,8 +149,8 @@ impl DetectionRates {
 pub(super) struct LookRates {
     pub(super) object: f64,
     pub(super) clutter: f64,
-    /// True if the vehicle states its field of view: otherwise it may not have looked there.
-    pub(super) is_view_stated: bool,
+    /// True if the vehicle states its pose: otherwise it may not have looked there.
+    pub(super) is_view_known: bool,
 }
 
 impl LookRates {
@@ -233,13 +233,15 @@ pub(super) struct SensorHistory {
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) looks: u32,
-    /// True if the vehicle stated its field of view at the last miss.
-    is_view_stated: bool,
+    /// True if the place was in the vehicle's known field of view at the last miss.
+    is_view_known: bool,
     /// Detections and looks since the last judgement.
     unjudged: ExistenceStatement,
     judged_at: Timestamp,
     /// Evidence of the results, nats; it fades.
     sequence: f64,
+    /// Evidence of all misses before the first detection, nats.
+    absence: f64,
     /// Fading sums of the evidence of confidences, nats, and of their number.
     score: f64,
     weight: f64,
@@ -262,10 +264,11 @@ impl SensorHistory {
             last_hit: None,
             position: Vector2::zeros(),
             looks: 0,
-            is_view_stated: false,
+            is_view_known: false,
             unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,
+            absence: 0.0,
             score: 0.0,
             weight: 0.0,
         }
@@ -294,8 +297,9 @@ impl SensorHistory {
     /// Records a look at the object in view without a detection.
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
         self.look(at, rates.nats(false));
+        self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
         self.state = self.state.after(false);
-        self.is_view_stated = rates.is_view_stated;
+        self.is_view_known = rates.is_view_known;
     }
 
     /// Counts a miss as a statement of the vehicle that the place is empty.
@@ -340,8 +344,8 @@ impl SensorHistory {
 
     /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
-        if self.is_view_stated && self.last_hit.is_none() {
-            self.kept(at) * self.sequence
+        if self.is_view_known && self.last_hit.is_none() {
+            self.kept(at) * self.absence
         } else {
             0.0
         }

@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{ExistenceStatement, LookRates, LookState};
+use super::existence::{ExistenceStatement, LookRates, LookState, logistic};
 use super::foreign::ForeignObjects;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
@@ -399,7 +399,7 @@ impl InstantUpdate<'_> {
         }
         for (number, statement) in due {
             let look = &looks[number];
-            self.judge(look, scans[look.scan].sensor, statement, evidence);
+            self.judge(look, &scans[look.scan], statement, evidence);
         }
     }
 
@@ -409,7 +409,9 @@ impl InstantUpdate<'_> {
         if track.vehicle.is_some() {
             return;
         }
-        let exists = track.existence.probability();
+        let fleet = &self.sensors.fleet;
+        let denied = track.denied_nats(self.at, |id| fleet.trust(id));
+        let exists = logistic(track.existence.log_odds() + denied.unwrap_or(0.0));
         if track.is_confirmed() && exists > CERTAIN && !track.is_settled {
             track.is_settled = true;
             self.sensors.settle(track.spawned_by, true);
@@ -436,12 +438,13 @@ impl InstantUpdate<'_> {
     fn judge(
         &mut self,
         look: &Look,
-        vehicle: SensorId,
+        scan: &Scan<'_>,
         statement: ExistenceStatement,
         evidence: &mut Vec<Evidence>,
     ) {
-        let track = &self.tracks[look.track];
+        let (track, vehicle) = (&self.tracks[look.track], scan.sensor);
         let label = track.label(self.config);
+        let detected = look.detection.map(|number| scan.detections[number].object);
         let (sensor, fleet) = match self.sensors.with_fleet(vehicle) {
             Some(both) => both,
             None => return,
@@ -451,7 +454,13 @@ impl InstantUpdate<'_> {
             .centre()
             .map_or(0.0, |centre| (look.place - centre).norm());
         let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
-        let Some(judgement) = judgement else { return };
+        let judgement = match (judgement, detected) {
+            (None, _) => return,
+            (Some(Judgement::Correct), Some(object)) if sensor.misplaces(object, self.config) => {
+                Judgement::Misplaced
+            }
+            (Some(judgement), _) => judgement,
+        };
         let correct = judgement == Judgement::Correct;
         fleet.count(vehicle, &mut sensor.counts, correct);
         evidence.push(Evidence {
