@@ -61,6 +61,7 @@ impl Gauge {
                 pivot: sensor.pose_bias.pivot(),
                 before: error * kept,
                 after: sensor.pose_bias.error(),
+                trust: sensors.fleet.trust(sensor.id),
                 weight: weight(sensor),
             });
         }
@@ -71,11 +72,13 @@ impl Gauge {
                 continue;
             };
             let common = after.motion.less(&before.motion);
-            for (member, consistency) in members.iter().zip(&after.consistencies) {
+            for (number, member) in members.iter().enumerate() {
                 if let Some(sensor) = sensors.get_mut(member.sensor) {
                     let part = common.at(&member.pivot);
                     sensor.pose_bias.take_back(&part, prior);
-                    sensor.pose_bias.set_consistency(*consistency);
+                    if let Some(consistency) = after.consistencies.get(number) {
+                        sensor.pose_bias.set_consistency(*consistency);
+                    }
                 }
             }
         }
@@ -104,6 +107,9 @@ struct GroupMember {
     /// Its error before the round, faded, and after it.
     before: Vector4<f64>,
     after: Vector4<f64>,
+    /// Weight among those that decide what most have in common: vehicles that stand have no more of it than others.
+    trust: f64,
+    /// Weight in what they have in common.
     weight: f64,
 }
 
@@ -120,7 +126,7 @@ struct Motion {
 #[derive(Debug)]
 struct Consensus {
     motion: Motion,
-    /// By member, how well its error agrees with the motion: 0 to 1.
+    /// By member, how well its error agrees with the motion: 0 to 1; empty without a majority.
     consistencies: Vec<f64>,
 }
 
@@ -141,7 +147,7 @@ impl Consensus {
     ///
     /// Reweighted least squares (Rousseeuw, Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5): a fit that
     /// a minority cannot move, here Huber's M-estimate with the median of the residuals as scale, then least squares
-    /// with weights by the residuals from that fit. So errors as usual in the group count alike.
+    /// with weights by the residuals from that fit. Errors within the group's usual spread therefore weigh nearly the same.
     fn of(
         members: &[GroupMember],
         error: impl Fn(&GroupMember) -> Vector4<f64>,
@@ -150,7 +156,7 @@ impl Consensus {
         let fit = |weights: &[f64]| {
             let mut sums = MotionSums::default();
             for (member, weight) in members.iter().zip(weights) {
-                sums.add(&member.pivot, &error(member), member.weight * weight, prior);
+                sums.add(&member.pivot, &error(member), *weight, prior);
             }
             sums.motion()
         };
@@ -160,21 +166,23 @@ impl Consensus {
                 .map(|member| prior.deviations(&(error(member) - motion.at(&member.pivot))))
                 .collect()
         };
-        let mut weights = vec![1.0; members.len()];
-        let trusted = members.iter().filter(|member| member.weight > 0.0).count();
+        let trusted = members.iter().filter(|member| member.trust > 0.0).count();
         if trusted < Self::MIN_MEMBERS {
+            let weights: Vec<f64> = members.iter().map(|member| member.weight).collect();
             return Some(Self {
                 motion: fit(&weights)?,
-                consistencies: weights,
+                consistencies: Vec::new(),
             });
         }
+        let mut weights: Vec<f64> = members.iter().map(|member| member.trust).collect();
         let (mut from_fit, mut median) = (Vec::new(), 0.0);
         for _ in 0..Self::ITERATIONS {
             from_fit = residuals(&fit(&weights)?);
             median = weighted_median(members, &from_fit).max(Self::MIN_MEDIAN);
             weights = from_fit
                 .iter()
-                .map(|residual| (median / residual).min(1.0))
+                .zip(members)
+                .map(|(residual, member)| member.trust * (median / residual).min(1.0))
                 .collect();
         }
         let scale = Self::OUTLYING * deviation(median, trusted);
@@ -182,8 +190,13 @@ impl Consensus {
             .iter()
             .map(|residual| (-(residual / scale).powi(2)).exp())
             .collect();
+        let weights: Vec<f64> = consistencies
+            .iter()
+            .zip(members)
+            .map(|(consistency, member)| consistency * member.weight)
+            .collect();
         Some(Self {
-            motion: fit(&consistencies)?,
+            motion: fit(&weights)?,
             consistencies,
         })
     }
@@ -258,12 +271,12 @@ impl MotionSums {
     }
 }
 
-/// The residual up to which the members have half of the weight.
+/// The residual up to which the members have half of the trust.
 fn weighted_median(members: &[GroupMember], residuals: &[f64]) -> f64 {
     let mut sorted: Vec<(f64, f64)> = residuals
         .iter()
         .zip(members)
-        .map(|(residual, member)| (*residual, member.weight))
+        .map(|(residual, member)| (*residual, member.trust))
         .collect();
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
     let half = sorted.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;

@@ -247,13 +247,13 @@ impl SensorModel {
         LookRates {
             object: object.rate(state),
             clutter: self.clutter.rate(state),
-            is_view_known: self.coverage.position().is_some(),
+            has_pose: self.coverage.position().is_some(),
         }
     }
 
     /// True if the vehicle places an object wrongly by more than it states, while its errors are far from those of most
     /// others.
-    pub(super) fn misplaces(&self, object: &PerceivedObject, config: &TracksConfig) -> bool {
+    pub(super) fn shifts(&self, object: &PerceivedObject, config: &TracksConfig) -> bool {
         let Some(stated) = object.covariance() else {
             return false;
         };

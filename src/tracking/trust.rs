@@ -42,7 +42,7 @@ pub(super) enum Judgement {
     /// The vehicle did not detect an object that exists.
     Miss,
     /// The vehicle detected an object that exists, at a place that is wrong by more than it states.
-    Misplaced,
+    Shifted,
 }
 
 /// Evidence of all vehicles but one about an object.

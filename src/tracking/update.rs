@@ -367,6 +367,9 @@ impl InstantUpdate<'_> {
             track.existence.add(scan.trust * nats);
             let statement = match look.detection.map(|number| &scan.detections[number]) {
                 Some(detection) => {
+                    let sensor = self.sensors.get(scan.sensor);
+                    let is_shifted =
+                        sensor.is_some_and(|sensor| sensor.shifts(detection.object, self.config));
                     let slot = if scan.is_trusted() {
                         track.history.for_hit(scan.sensor, at)
                     } else {
@@ -375,6 +378,7 @@ impl InstantUpdate<'_> {
                     slot.and_then(|history| {
                         let position = detection.measurement.position;
                         history.hit(at, position, nats, detection.confidence_nats);
+                        history.is_shifted = is_shifted;
                         history.take_due(at)
                     })
                 }
@@ -382,6 +386,7 @@ impl InstantUpdate<'_> {
                     history.miss(at, &look.rates);
                     if !look.is_hidden {
                         history.state_miss();
+                        history.deny(&look.rates);
                     }
                     history.take_due(at)
                 }),
@@ -399,7 +404,7 @@ impl InstantUpdate<'_> {
         }
         for (number, statement) in due {
             let look = &looks[number];
-            self.judge(look, &scans[look.scan], statement, evidence);
+            self.judge(look, scans[look.scan].sensor, statement, evidence);
         }
     }
 
@@ -438,13 +443,12 @@ impl InstantUpdate<'_> {
     fn judge(
         &mut self,
         look: &Look,
-        scan: &Scan<'_>,
+        vehicle: SensorId,
         statement: ExistenceStatement,
         evidence: &mut Vec<Evidence>,
     ) {
-        let (track, vehicle) = (&self.tracks[look.track], scan.sensor);
+        let track = &self.tracks[look.track];
         let label = track.label(self.config);
-        let detected = look.detection.map(|number| scan.detections[number].object);
         let (sensor, fleet) = match self.sensors.with_fleet(vehicle) {
             Some(both) => both,
             None => return,
@@ -454,12 +458,14 @@ impl InstantUpdate<'_> {
             .centre()
             .map_or(0.0, |centre| (look.place - centre).norm());
         let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
-        let judgement = match (judgement, detected) {
-            (None, _) => return,
-            (Some(Judgement::Correct), Some(object)) if sensor.misplaces(object, self.config) => {
-                Judgement::Misplaced
-            }
-            (Some(judgement), _) => judgement,
+        let is_shifted = || {
+            let mut histories = track.history.iter();
+            histories.any(|history| history.sensor == vehicle && history.is_shifted)
+        };
+        let judgement = match judgement {
+            None => return,
+            Some(Judgement::Correct) if is_shifted() => Judgement::Shifted,
+            Some(judgement) => judgement,
         };
         let correct = judgement == Judgement::Correct;
         fleet.count(vehicle, &mut sensor.counts, correct);
@@ -599,6 +605,9 @@ impl InstantUpdate<'_> {
                 log_odds += scan.trust * nats;
                 if let Some(history) = track.history.for_look(scan.sensor, at) {
                     history.miss(at, &rates);
+                    if !scan.occlusion.hides(&position) {
+                        history.deny(&rates);
+                    }
                 }
             }
         }

@@ -9,6 +9,8 @@ struct Scene {
     shift_m: f64,
     speed_mps: f64,
     has_pose: bool,
+    /// True if the false ones stand where they state, and the others move about their places.
+    false_ones_stand: bool,
 }
 
 impl Scene {
@@ -19,6 +21,7 @@ impl Scene {
             shift_m,
             speed_mps: 0.0,
             has_pose: false,
+            false_ones_stand: false,
         }
     }
 
@@ -58,7 +61,11 @@ impl Scene {
                         place.y + noise(&mut rng, reach_m),
                     )
                 });
-                let jitter_m = noise(&mut rng, 0.01);
+                let jitter_m = if is_false && self.false_ones_stand {
+                    0.0
+                } else {
+                    noise(&mut rng, 0.01)
+                };
                 let pose = WirePose::new(2.0 + jitter_m, n as f64, 0.0);
                 let report = ObjectReport {
                     pose: self.has_pose.then_some(pose),
@@ -123,6 +130,22 @@ fn one_of_several_that_shifts_all_objects_hardly_moves_the_map() {
             }
         }
     }
+}
+
+/// A vehicle that stands has more weight in what all have in common, and no more in what counts as common.
+#[test]
+fn one_that_stands_and_shifts_all_objects_is_not_the_majority() {
+    let scene = Scene {
+        has_pose: true,
+        false_ones_stand: true,
+        ..Scene::of(4, 1, 1.0)
+    };
+    let (drag_m, counts) = scene.drag();
+    println!("one of 4 stands, shift 1 m: {drag_m:.3} m, {counts:?}");
+    assert!(drag_m < 0.05, "{drag_m} m");
+    let (false_one, honest) = counts.split_last().unwrap();
+    assert!(honest.iter().all(|(_, wrong)| *wrong == 0), "{honest:?}");
+    assert!(false_one.1 > false_one.0, "{false_one:?}");
 }
 
 /// As many as can be out-voted, all by the same shift.
