@@ -46,6 +46,10 @@ const SOLE_NATS: f64 = 2.0;
 /// outweigh it, each by -2.5 nats at most.
 const MAX_DENIED_NATS: f64 = 4.0;
 
+/// Minimum number of vehicles whose looks count against an object that one vehicle alone detects: one statement against
+/// another does not tell which vehicle is wrong.
+const MIN_DENYING: usize = 2;
+
 /// Maximum age of a detection that is evidence of a present object.
 const DETECTED_WITHIN: Duration = Duration::from_secs(1);
 
@@ -227,8 +231,8 @@ impl Track {
         }
     }
 
-    /// Evidence against an object that one vehicle alone has detected, of those that have its place in view, nats; `None` if
-    /// several have detected it.
+    /// Evidence against an object that one vehicle alone has detected, nats: that of all vehicles that have its place in
+    /// view, if there are at least [`MIN_DENYING`]. `None` if several vehicles have detected the object.
     pub(super) fn denied_nats(
         &self,
         at: Timestamp,
@@ -239,12 +243,17 @@ impl Track {
             .iter()
             .filter(|history| history.last_hit.is_some() && trust(history.sensor) > 0.0);
         let is_sole = self.vehicle.is_none() && witnesses.nth(1).is_none();
-        is_sole.then(|| {
-            self.history
-                .iter()
-                .map(|history| trust(history.sensor) * history.denied_nats(at))
-                .sum()
-        })
+        if !is_sole {
+            return None;
+        }
+        let mut denying = 0;
+        let mut nats = 0.0;
+        for history in self.history.iter() {
+            let denied = trust(history.sensor) * history.denied_nats(at);
+            denying += usize::from(denied < 0.0);
+            nats += denied;
+        }
+        Some(if denying >= MIN_DENYING { nats } else { 0.0 })
     }
 
     /// The histories of the vehicles that detected the object since `limit`.
