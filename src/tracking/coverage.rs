@@ -104,11 +104,6 @@ impl Coverage {
             .min(Self::MAX_RANGE_M)
     }
 
-    /// True if the vehicle states its field of view.
-    pub(super) fn is_stated(&self) -> bool {
-        self.stated.is_some()
-    }
-
     /// Detection rates at a reported position, if nothing hides it; `None` outside the field of view.
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<&DetectionRates> {
         let offset = reported - self.centre?;

@@ -149,8 +149,8 @@ impl DetectionRates {
 pub(super) struct LookRates {
     pub(super) object: f64,
     pub(super) clutter: f64,
-    /// True if the vehicle states its field of view: otherwise it may not have looked there.
-    pub(super) is_view_stated: bool,
+    /// True if the vehicle states its pose: otherwise it may not have looked there.
+    pub(super) has_pose: bool,
 }
 
 impl LookRates {
@@ -233,13 +233,17 @@ pub(super) struct SensorHistory {
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) looks: u32,
-    /// True if the vehicle stated its field of view at the last miss.
-    is_view_stated: bool,
+    /// True if the place was in the vehicle's known field of view when nothing hid it last.
+    is_view_known: bool,
+    /// True if the last detection was at a place that is wrong by more than the vehicle states.
+    pub(super) is_shifted: bool,
     /// Detections and looks since the last judgement.
     unjudged: ExistenceStatement,
     judged_at: Timestamp,
     /// Evidence of the results, nats; it fades.
     sequence: f64,
+    /// Evidence of all misses that nothing hid before the first detection, nats.
+    absence: f64,
     /// Fading sums of the evidence of confidences, nats, and of their number.
     score: f64,
     weight: f64,
@@ -262,10 +266,12 @@ impl SensorHistory {
             last_hit: None,
             position: Vector2::zeros(),
             looks: 0,
-            is_view_stated: false,
+            is_view_known: false,
+            is_shifted: false,
             unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,
+            absence: 0.0,
             score: 0.0,
             weight: 0.0,
         }
@@ -295,12 +301,17 @@ impl SensorHistory {
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
         self.look(at, rates.nats(false));
         self.state = self.state.after(false);
-        self.is_view_stated = rates.is_view_stated;
     }
 
     /// Counts a miss as a statement of the vehicle that the place is empty.
     pub(super) fn state_miss(&mut self) {
         self.unjudged.looks += 1;
+    }
+
+    /// Counts a miss at a place that nothing hides as evidence that there never was an object.
+    pub(super) fn deny(&mut self, rates: &LookRates) {
+        self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
+        self.is_view_known = rates.has_pose;
     }
 
     /// Fades earlier evidence and counts a look.
@@ -340,8 +351,8 @@ impl SensorHistory {
 
     /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
-        if self.is_view_stated && self.last_hit.is_none() {
-            self.kept(at) * self.sequence
+        if self.is_view_known && self.last_hit.is_none() {
+            self.kept(at) * self.absence
         } else {
             0.0
         }

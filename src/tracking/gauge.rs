@@ -4,7 +4,8 @@
 //! unequal gains decides on it, and it would wander without end. Therefore a round leaves the common motion of
 //! observers that correspond, directly or through others, as it was. It only fades with the mean of the errors: those of
 //! observers that leave or join do not move the map at once. If each faded by itself, those that last would take over
-//! the errors of those that fade.
+//! the errors of those that fade. What a group has in common is the [`Consensus`] of most observers: the errors of a minority
+//! do not count as common.
 
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
@@ -52,27 +53,35 @@ impl Gauge {
             let (_, of_sensor) = before(&self.before, sensor);
             kept[group] = (kept[group].0 + weight * of_sensor, kept[group].1 + weight);
         }
-        let mut sums = vec![MotionSums::default(); known];
+        let mut members: Vec<Vec<GroupMember>> = vec![Vec::new(); known];
         for sensor in observers() {
             let group = self.group(sensor.id.number());
-            let pose_bias = &sensor.pose_bias;
             let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
             let (error, _) = before(&self.before, sensor);
-            sums[group].add(
-                &pose_bias.pivot(),
-                &(pose_bias.error() - error * kept),
-                weight(sensor),
-                prior,
-            );
+            members[group].push(GroupMember {
+                sensor: sensor.id,
+                pivot: sensor.pose_bias.pivot(),
+                before: error * kept,
+                after: sensor.pose_bias.error(),
+                trust: sensors.fleet.trust(sensor.id),
+                weight: weight(sensor),
+            });
         }
-        let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
-        for sensor in sensors
-            .iter_mut()
-            .filter(|sensor| sensor.id.number() < known)
-        {
-            if let Some(common) = &common[self.group(sensor.id.number())] {
-                let part = common.at(&sensor.pose_bias.pivot());
-                sensor.pose_bias.take_back(&part, prior);
+        for members in members.iter().filter(|members| members.len() > 1) {
+            let before = Consensus::of(members, |member| member.before, prior);
+            let after = Consensus::of(members, |member| member.after, prior);
+            let (Some(before), Some(after)) = (before, after) else {
+                continue;
+            };
+            let common = after.motion.less(&before.motion);
+            for (number, member) in members.iter().enumerate() {
+                if let Some(sensor) = sensors.get_mut(member.sensor) {
+                    let part = common.at(&member.pivot);
+                    sensor.pose_bias.take_back(&part, prior);
+                    if let Some(consistency) = after.consistencies.get(number) {
+                        sensor.pose_bias.set_consistency(*consistency);
+                    }
+                }
             }
         }
     }
@@ -92,6 +101,20 @@ impl Gauge {
     }
 }
 
+/// One observer of a group in a round.
+#[derive(Debug, Clone)]
+struct GroupMember {
+    sensor: SensorId,
+    pivot: Vector2<f64>,
+    /// Its error before the round, faded, and after it.
+    before: Vector4<f64>,
+    after: Vector4<f64>,
+    /// Weight among those that decide what most have in common: vehicles that stand have no more of it than others.
+    trust: f64,
+    /// Weight in what they have in common.
+    weight: f64,
+}
+
 /// Shift, rotation and delay of all observers together.
 #[derive(Debug)]
 struct Motion {
@@ -101,7 +124,104 @@ struct Motion {
     delay_s: f64,
 }
 
+/// What most observers of a group have in common.
+#[derive(Debug)]
+struct Consensus {
+    motion: Motion,
+    /// By member, how well its error agrees with the motion: 0 to 1; empty without a majority.
+    consistencies: Vec<f64>,
+}
+
+impl Consensus {
+    /// Minimum number of observers among which there is a majority.
+    const MIN_MEMBERS: usize = 3;
+
+    /// Number of reweighting steps.
+    const ITERATIONS: usize = 20;
+
+    /// Minimum of the median residual, in standard deviations of the errors.
+    const MIN_MEDIAN: f64 = 0.05;
+
+    /// Residual in robust standard deviations at which the weight of an observer falls to 1/e.
+    const OUTLYING: f64 = 2.5;
+
+    /// The consensus on errors; `None` without weight.
+    ///
+    /// Reweighted least squares (Rousseeuw, Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5): a fit that
+    /// a minority cannot move, here Huber's M-estimate with the median of the residuals as scale, then least squares
+    /// with weights by the residuals from that fit. Errors within the group's usual spread therefore weigh nearly the same.
+    fn of(
+        members: &[GroupMember],
+        error: impl Fn(&GroupMember) -> Vector4<f64>,
+        prior: &BiasPrior,
+    ) -> Option<Self> {
+        let fit = |weights: &[f64]| {
+            let mut sums = MotionSums::default();
+            for (member, weight) in members.iter().zip(weights) {
+                sums.add(&member.pivot, &error(member), *weight, prior);
+            }
+            sums.motion()
+        };
+        let residuals = |motion: &Motion| -> Vec<f64> {
+            members
+                .iter()
+                .map(|member| prior.deviations(&(error(member) - motion.at(&member.pivot))))
+                .collect()
+        };
+        let trusted = members.iter().filter(|member| member.trust > 0.0).count();
+        if trusted < Self::MIN_MEMBERS {
+            let weights: Vec<f64> = members.iter().map(|member| member.weight).collect();
+            return Some(Self {
+                motion: fit(&weights)?,
+                consistencies: Vec::new(),
+            });
+        }
+        let mut weights: Vec<f64> = members.iter().map(|member| member.trust).collect();
+        let mut from_fit = Vec::new();
+        let mut median = 0.0;
+        for _ in 0..Self::ITERATIONS {
+            from_fit = residuals(&fit(&weights)?);
+            median = weighted_median(members, &from_fit).max(Self::MIN_MEDIAN);
+            weights = from_fit
+                .iter()
+                .zip(members)
+                .map(|(residual, member)| member.trust * (median / residual).min(1.0))
+                .collect();
+        }
+        let scale = Self::OUTLYING * deviation(median, trusted);
+        let consistencies: Vec<f64> = from_fit
+            .iter()
+            .map(|residual| (-(residual / scale).powi(2)).exp())
+            .collect();
+        let weights: Vec<f64> = consistencies
+            .iter()
+            .zip(members)
+            .map(|(consistency, member)| consistency * member.weight)
+            .collect();
+        Some(Self {
+            motion: fit(&weights)?,
+            consistencies,
+        })
+    }
+}
+
+/// Standard deviation by the median of so many residuals, with the correction for few of them (Rousseeuw, Leroy 1987,
+/// section 5.1).
+fn deviation(median: f64, residuals: usize) -> f64 {
+    1.4826 * (1.0 + 5.0 / (residuals as f64 - 1.0)) * median
+}
+
 impl Motion {
+    /// What this motion adds to an earlier one about the same place.
+    fn less(&self, before: &Self) -> Self {
+        Self {
+            about: self.about,
+            shift: self.shift - before.shift,
+            rotation_rad: self.rotation_rad - before.rotation_rad,
+            delay_s: self.delay_s - before.delay_s,
+        }
+    }
+
     /// Its part of the error of an observer: offset, rotation and delay.
     fn at(&self, pivot: &Vector2<f64>) -> Vector4<f64> {
         let offset = self.shift + quarter_turn(&(pivot - self.about)) * self.rotation_rad;
@@ -109,7 +229,7 @@ impl Motion {
     }
 }
 
-/// Weighted sums for the motion that is nearest to the changes of a group, in standard deviations of the errors.
+/// Weighted sums for the motion that is nearest to the errors of a group, in standard deviations of the errors.
 #[derive(Debug, Clone, Default)]
 struct MotionSums {
     about: Option<Vector2<f64>>,
@@ -120,7 +240,7 @@ struct MotionSums {
 }
 
 impl MotionSums {
-    fn add(&mut self, pivot: &Vector2<f64>, change: &Vector4<f64>, weight: f64, prior: &BiasPrior) {
+    fn add(&mut self, pivot: &Vector2<f64>, error: &Vector4<f64>, weight: f64, prior: &BiasPrior) {
         let arm = quarter_turn(&(pivot - *self.about.get_or_insert(*pivot)));
         let offset = weight / (prior.offset_m * prior.offset_m);
         let rotation = weight / (prior.heading_rad * prior.heading_rad);
@@ -136,9 +256,9 @@ impl MotionSums {
             both.y,
             both.dot(&arm) + rotation,
         );
-        let turned = both.dot(&change.xy()) + rotation * change.z;
-        self.gradient += Vector3::new(offset * change.x, offset * change.y, turned);
-        self.delay_s += weight * change.w;
+        let turned = both.dot(&error.xy()) + rotation * error.z;
+        self.gradient += Vector3::new(offset * error.x, offset * error.y, turned);
+        self.delay_s += weight * error.w;
         self.weight += weight;
     }
 
@@ -152,6 +272,23 @@ impl MotionSums {
             delay_s: self.delay_s / self.weight,
         })
     }
+}
+
+/// The residual up to which the members have half of the trust.
+fn weighted_median(members: &[GroupMember], residuals: &[f64]) -> f64 {
+    let mut sorted: Vec<(f64, f64)> = residuals
+        .iter()
+        .zip(members)
+        .map(|(residual, member)| (*residual, member.trust))
+        .collect();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = sorted.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
+    let mut below = 0.0;
+    let median = sorted.iter().find(|(_, weight)| {
+        below += weight;
+        below >= half
+    });
+    median.map_or(0.0, |(residual, _)| *residual)
 }
 
 fn quarter_turn(offset: &Vector2<f64>) -> Vector2<f64> {

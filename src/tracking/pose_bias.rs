@@ -45,6 +45,12 @@ pub(super) struct BiasPrior {
 }
 
 impl BiasPrior {
+    /// Distance of two errors in standard deviations.
+    pub(super) fn deviations(&self, difference: &Vector4<f64>) -> f64 {
+        let deviations = Vector4::new(self.offset_m, self.offset_m, self.heading_rad, self.delay_s);
+        difference.component_div(&deviations).norm()
+    }
+
     fn covariance(&self) -> Matrix4<f64> {
         let deviations = Vector4::new(self.offset_m, self.offset_m, self.heading_rad, self.delay_s);
         Matrix4::from_diagonal(&deviations.component_mul(&deviations))
@@ -79,6 +85,8 @@ pub(super) struct PoseBias {
     pairs: f64,
     /// Time for which the vehicle has stood where it says, seconds.
     stood_s: f64,
+    /// How well the errors agree with those of most others, 0 to 1.
+    consistency: f64,
 }
 
 impl PoseBias {
@@ -91,6 +99,7 @@ impl PoseBias {
             covariance: prior.covariance(),
             pairs: 0.0,
             stood_s: 0.0,
+            consistency: 1.0,
         }
     }
 
@@ -117,6 +126,17 @@ impl PoseBias {
     /// Weight in what all have in common: the longer an error lasts, the more is known of it.
     pub(super) fn weight(&self, prior: &BiasPrior) -> f64 {
         (1.0 + self.stood_s / prior.memory_s).min(MAX_WEIGHT)
+    }
+
+    /// How well the errors agree with those of most vehicles that see the same objects: 1 as well as theirs with each other,
+    /// 0 if they are far from them. It returns to 1 as the errors fade.
+    pub(super) fn consistency(&self) -> f64 {
+        self.consistency
+    }
+
+    /// Sets how well the errors agree with those of most others.
+    pub(super) fn set_consistency(&mut self, consistency: f64) {
+        self.consistency = consistency;
     }
 
     /// Takes back a part of the error that the vehicle shares with others.
@@ -240,6 +260,7 @@ impl PoseBias {
         self.covariance =
             self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
         self.pairs *= kept;
+        self.consistency = 1.0 - (1.0 - self.consistency) * kept;
         self.at = self.at.max(at);
         kept
     }

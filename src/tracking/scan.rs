@@ -11,8 +11,8 @@ use super::occlusion::OcclusionMap;
 use super::sensors::SensorModel;
 use crate::wire::{ObjectReport, PerceivedObject};
 
-/// Minimum trust by which the covariances of positions are divided.
-const MIN_TRUST: f64 = 0.05;
+/// Minimum weight of a vehicle's positions, by which their covariances are divided.
+const MIN_WEIGHT: f64 = 0.05;
 
 /// A detection of a report, corrected by the estimated pose bias.
 #[derive(Debug)]
@@ -56,6 +56,7 @@ impl<'a> Scan<'a> {
     ) -> Self {
         let own = report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
         let correct = sensor.pose_bias.corrector();
+        let weight = (trust * sensor.pose_bias.consistency()).max(MIN_WEIGHT);
         let mut occlusion = OcclusionMap::new(sensor.coverage.position());
         let mut detections = Vec::with_capacity(report.objects.len());
         for (index, object) in report.objects.iter().enumerate() {
@@ -79,7 +80,7 @@ impl<'a> Scan<'a> {
                 reported,
                 measurement: Measurement {
                     position: correct(&reported),
-                    independent: covariance / trust.max(MIN_TRUST),
+                    independent: covariance / weight,
                     common_m: class.common_m,
                 },
             });

@@ -30,6 +30,12 @@ const MIN_RANGE_M: f64 = 10.0;
 /// Time after which a vehicle that states no pose and stays is known to stand.
 const STAYS_FOR: Duration = Duration::from_secs(120);
 
+/// Consistency of a vehicle's errors with those of most others below which the places that it states are judged.
+const MIN_CONSISTENCY: f64 = 0.1;
+
+/// Normalised squared error, of two dimensions, that 1 % of the places exceed.
+const CERTAIN_SQUARED: f64 = 9.21;
+
 /// Models of the vehicles that are heard, and the trust in all.
 #[derive(Debug, Clone)]
 pub(super) struct Sensors {
@@ -241,8 +247,21 @@ impl SensorModel {
         LookRates {
             object: object.rate(state),
             clutter: self.clutter.rate(state),
-            is_view_stated: self.coverage.is_stated(),
+            has_pose: self.coverage.position().is_some(),
         }
+    }
+
+    /// True if the vehicle places an object wrongly by more than it states, while its errors are far from those of most
+    /// others.
+    pub(super) fn shifts(&self, object: &PerceivedObject, config: &TracksConfig) -> bool {
+        let Some(stated) = object.covariance() else {
+            return false;
+        };
+        let reported = Vector2::new(object.x_m, object.y_m);
+        let error = self.pose_bias.corrector()(&reported) - reported;
+        let variance = stated.matrix().trace() / 2.0 + config.noise_floor_m.powi(2);
+        self.pose_bias.consistency() < MIN_CONSISTENCY
+            && error.norm_squared() > CERTAIN_SQUARED * variance
     }
 
     /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.

@@ -1,9 +1,11 @@
+mod absent;
 mod beside;
 mod crowd;
 mod fast;
 mod fixed;
 mod foreign;
 mod passing;
+mod shifted;
 mod trust;
 
 use std::collections::BTreeSet;

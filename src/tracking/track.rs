@@ -42,6 +42,14 @@ pub(super) const CONFIRMED_HITS: u32 = 5;
 /// Maximum evidence of the looks at an object that one vehicle alone detects, nats.
 const SOLE_NATS: f64 = 2.0;
 
+/// Maximum evidence for an object that one vehicle alone detects while others have its place in view, nats. Two of these
+/// outweigh it, each by -2.5 nats at most.
+const MAX_DENIED_NATS: f64 = 4.0;
+
+/// Minimum number of vehicles whose looks count against an object that one vehicle alone detects: one statement against
+/// another does not tell which vehicle is wrong.
+const MIN_DENYING: usize = 2;
+
 /// Maximum age of a detection that is evidence of a present object.
 const DETECTED_WITHIN: Duration = Duration::from_secs(1);
 
@@ -208,20 +216,44 @@ impl Track {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
         let looks = self.existence.log_odds_at(at, leaving_hz, is_detected);
         let mut confidences = 0.0;
-        let mut denied = 0.0;
-        let mut witnesses = 0;
         for history in self.history.iter() {
-            let trust = trust(history.sensor);
-            confidences += trust * history.shared_confidence_nats(at);
-            denied += trust * history.denied_nats(at);
-            witnesses += usize::from(history.last_hit.is_some() && trust > 0.0);
+            confidences += trust(history.sensor) * history.shared_confidence_nats(at);
         }
+        let Some(denied) = self.denied_nats(at, trust) else {
+            return logistic(looks + confidences);
+        };
         // What deceives one vehicle deceives it again and again.
-        if witnesses < 2 && self.vehicle.is_none() {
-            logistic(looks.min(SOLE_NATS) + confidences + denied)
+        let sole = looks.min(SOLE_NATS) + confidences;
+        if denied < 0.0 {
+            logistic(sole.min(MAX_DENIED_NATS) + denied)
         } else {
-            logistic(looks + confidences)
+            logistic(sole)
         }
+    }
+
+    /// Evidence against an object that one vehicle alone has detected, nats: that of all vehicles that have its place in
+    /// view, if there are at least [`MIN_DENYING`]. `None` if several vehicles have detected the object.
+    pub(super) fn denied_nats(
+        &self,
+        at: Timestamp,
+        trust: impl Fn(SensorId) -> f64,
+    ) -> Option<f64> {
+        let mut witnesses = self
+            .history
+            .iter()
+            .filter(|history| history.last_hit.is_some() && trust(history.sensor) > 0.0);
+        let is_sole = self.vehicle.is_none() && witnesses.nth(1).is_none();
+        if !is_sole {
+            return None;
+        }
+        let mut denying = 0;
+        let mut nats = 0.0;
+        for history in self.history.iter() {
+            let denied = trust(history.sensor) * history.denied_nats(at);
+            denying += usize::from(denied < 0.0);
+            nats += denied;
+        }
+        Some(if denying >= MIN_DENYING { nats } else { 0.0 })
     }
 
     /// The histories of the vehicles that detected the object since `limit`.

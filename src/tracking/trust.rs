@@ -2,8 +2,8 @@
 //!
 //! Every [`JUDGED_AFTER`] of looks, a vehicle's statement about an object is compared with the evidence of the others.
 //! Where they agree that the object exists, a detection is correct; not to have detected it since the last judgement is a
-//! miss if most vehicles detect objects at that distance. Where at least two others look and agree that nothing exists, a detection
-//! is a false positive. One vehicle against another settles nothing.
+//! miss if most of the others that look detect it, and most vehicles detect objects at that distance. Where at least two others
+//! look and agree that nothing exists, a detection is a false positive. One vehicle against another settles nothing.
 
 use std::collections::BTreeMap;
 
@@ -41,6 +41,8 @@ pub(super) enum Judgement {
     FalsePositive,
     /// The vehicle did not detect an object that exists.
     Miss,
+    /// The vehicle detected an object that exists, at a place that is wrong by more than it states.
+    Shifted,
 }
 
 /// Evidence of all vehicles but one about an object.
@@ -85,7 +87,11 @@ impl PeerEvidence {
         let exists = self.nats >= EXISTS_NATS;
         if self.detecting >= 1 && exists && share >= MIN_STATED {
             Some(Judgement::Correct)
-        } else if self.detecting >= 2 && exists && statement.hits == 0 {
+        } else if self.detecting >= 2
+            && 2 * self.detecting > self.looking
+            && exists
+            && statement.hits == 0
+        {
             Some(Judgement::Miss)
         } else if self.looking >= 2
             && self.detecting == 0

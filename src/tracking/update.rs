@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{ExistenceStatement, LookRates, LookState};
+use super::existence::{ExistenceStatement, LookRates, LookState, logistic};
 use super::foreign::ForeignObjects;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
@@ -369,6 +369,9 @@ impl InstantUpdate<'_> {
             track.existence.add(scan.trust * nats);
             let statement = match look.detection.map(|number| &scan.detections[number]) {
                 Some(detection) => {
+                    let sensor = self.sensors.get(scan.sensor);
+                    let is_shifted =
+                        sensor.is_some_and(|sensor| sensor.shifts(detection.object, self.config));
                     let slot = if scan.is_trusted() {
                         track.history.for_hit(scan.sensor, at)
                     } else {
@@ -377,6 +380,7 @@ impl InstantUpdate<'_> {
                     slot.and_then(|history| {
                         let position = detection.measurement.position;
                         history.hit(at, position, nats, detection.confidence_nats);
+                        history.is_shifted = is_shifted;
                         history.take_due(at)
                     })
                 }
@@ -384,6 +388,7 @@ impl InstantUpdate<'_> {
                     history.miss(at, &look.rates);
                     if !look.is_hidden {
                         history.state_miss();
+                        history.deny(&look.rates);
                     }
                     history.take_due(at)
                 }),
@@ -411,7 +416,9 @@ impl InstantUpdate<'_> {
         if track.vehicle.is_some() {
             return;
         }
-        let exists = track.existence.probability();
+        let fleet = &self.sensors.fleet;
+        let denied = track.denied_nats(self.at, |id| fleet.trust(id));
+        let exists = logistic(track.existence.log_odds() + denied.unwrap_or(0.0));
         if track.is_confirmed() && exists > CERTAIN && !track.is_settled {
             track.is_settled = true;
             self.sensors.settle(track.spawned_by, true);
@@ -453,7 +460,15 @@ impl InstantUpdate<'_> {
             .centre()
             .map_or(0.0, |centre| (look.place - centre).norm());
         let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
-        let Some(judgement) = judgement else { return };
+        let is_shifted = || {
+            let mut histories = track.history.iter();
+            histories.any(|history| history.sensor == vehicle && history.is_shifted)
+        };
+        let judgement = match judgement {
+            None => return,
+            Some(Judgement::Correct) if is_shifted() => Judgement::Shifted,
+            Some(judgement) => judgement,
+        };
         let correct = judgement == Judgement::Correct;
         fleet.count(vehicle, &mut sensor.counts, correct);
         evidence.push(Evidence {
@@ -596,6 +611,9 @@ impl InstantUpdate<'_> {
                 log_odds += scan.trust * nats;
                 if let Some(history) = track.history.for_look(scan.sensor, at) {
                     history.miss(at, &rates);
+                    if !scan.occlusion.hides(&position) {
+                        history.deny(&rates);
+                    }
                 }
             }
         }

@@ -321,23 +321,23 @@ fn dragged_by(shift_m: f64, stated_sigma_m: f64, has_pose: bool) -> f64 {
     places.into_iter().map(drag).fold(0.0, f64::max)
 }
 
-/// Its vehicle is one witness, with a common error that repetition does not reduce: the others outweigh it.
+/// Its shift is estimated as its pose error, against the majority of the others.
 #[test]
-fn a_vehicle_that_states_shifted_places_precisely_moves_the_map_by_a_part_of_the_shift() {
+fn a_vehicle_that_states_shifted_places_precisely_hardly_moves_the_map() {
     for has_pose in [false, true] {
         let honest_m = dragged_by(0.0, 0.3, has_pose);
         let dragged_m = [0.5, 1.0, 1.5].map(|shift_m| dragged_by(shift_m, 0.01, has_pose));
         println!(
             "{honest_m:.3} m if all are right, {dragged_m:.3?} m with one shifted by 0.5, 1.0 and 1.5 m, poses: {has_pose}"
         );
-        assert!(honest_m < 0.03 && dragged_m.iter().all(|drag_m| *drag_m < 0.4));
+        assert!(honest_m < 0.03 && dragged_m.iter().all(|drag_m| *drag_m < 0.05));
     }
 }
 
 /// Share of the maps in which a car that one vehicle invents is more probable than not, while four that have its place in
-/// view report nothing there: at a known location, and elsewhere, where the four come to count as overlooking it.
+/// view report nothing there: at a known location, and elsewhere.
 #[test]
-fn what_one_invents_at_a_known_location_is_no_fact_where_four_look() {
+fn what_one_invents_is_no_fact_where_four_look() {
     let place = Landmark {
         id: "slot-0".into(),
         position: Point2::new(20.0, 0.0),
@@ -414,5 +414,5 @@ fn what_one_invents_at_a_known_location_is_no_fact_where_four_look() {
         shares.push(f64::from(believed) / f64::from(maps));
     }
     println!("{shares:.3?} of the maps at a known location, and elsewhere");
-    assert!(shares[0] < 0.05, "{shares:?}");
+    assert!(shares.iter().all(|share| *share < 0.05), "{shares:?}");
 }
