@@ -140,14 +140,14 @@ trials: setup ## [measure] gaps of real cells that are killed, stopped and cut o
 
 joining: PACKAGES += iproute2 mosquitto-clients
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
-	cargo test --locked --test trials -- --ignored --exact joining::machines::three_machines_become_a_cell_by_the_commands_of_the_readme
+	cargo test --locked --test trials -- --ignored --exact joining::machines::readme_commands_form_cell
 
 clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
 	cargo test --release --locked --test trials -- --ignored --exact clocks::all --nocapture
 
 renewal: setup ## a cell of real nodes whose certificates of three minutes are renewed twice: gaps of its maps
-	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice_without_a_missed_map --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice --nocapture
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1
@@ -229,7 +229,7 @@ models-check: setup ## the boxes that the detector's tests expect, found once mo
 ifdef YOLOX
 	$(BUILD)/models-venv/bin/python3 actors/tests/data/onnx/photos.py $(YOLOX) > $(BUILD)/yolox-photos.json
 	YOLOX_MODEL=$(abspath $(YOLOX)) YOLOX_PHOTOS=$(abspath $(BUILD)/yolox-photos.json) \
-	    cargo test --locked -p ecod-actors --lib photographs_what_onnx_runtime -- --ignored --nocapture
+	    cargo test --locked -p ecod-actors --lib yolox_matches_onnx_runtime -- --ignored --nocapture
 else
 	@echo "no photographs were tried: YOLOX=FILE names an export of YOLOX without --decode_in_inference, such as yolox_nano.onnx"
 endif

@@ -455,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trouble_is_logged_once_and_hourly_and_is_over_when_nobody_sees_it_any_more() {
+    fn trouble_is_logged_hourly() {
         let mut register = TroubleRegister::default();
         let mut lines = 0;
         for s in 0..7300 {
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_cause_ends_after_a_whole_word() {
+    fn long_cause_ends_at_word() {
         let mut register = TroubleRegister::default();
         register.note(
             TroubleKind::ImplausibleSize,
@@ -515,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lasts_is_over_when_its_part_says_so() {
+    fn lasting_trouble_ends_when_settled() {
         let mut register = TroubleRegister::default();
         assert!(
             register
@@ -530,7 +530,7 @@ mod tests {
     /// Names come from outside: a host that invents names displaces the entries of neither this
     /// node nor other nodes.
     #[test]
-    fn invented_names_find_no_room_and_leave_none_of_theirs_behind() {
+    fn invented_names_displace_no_troubles() {
         let mut register = TroubleRegister::default();
         register.note(
             TroubleKind::ClockOff,
@@ -568,7 +568,7 @@ mod tests {
     }
 
     #[test]
-    fn the_parts_of_one_vehicle_leave_room_for_others() {
+    fn vehicle_parts_leave_room() {
         let mut register = TroubleRegister::default();
         for part in 0..100 {
             for kind in [TroubleKind::Malformed, TroubleKind::Misplaced] {
@@ -584,7 +584,7 @@ mod tests {
     }
 
     #[test]
-    fn strangers_leave_room_for_what_members_are_told() {
+    fn strangers_leave_room_for_members() {
         let mut register = TroubleRegister::default();
         let lines = (0..100).filter(|host| {
             let about = format!("10.0.0.{host}");
@@ -611,7 +611,7 @@ mod tests {
     }
 
     #[test]
-    fn claimed_names_leave_a_vehicle_its_share() {
+    fn claimed_names_leave_vehicle_its_share() {
         let mut register = TroubleRegister::default();
         for part in 0..100 {
             register.note(
@@ -629,7 +629,7 @@ mod tests {
     }
 
     #[test]
-    fn another_cause_is_shown_at_once_and_logged_within_a_minute() {
+    fn changed_cause_is_shown_immediately() {
         let mut register = TroubleRegister::default();
         register.note(
             TroubleKind::BrokerRefuses,
@@ -652,7 +652,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trouble_about_any_name_can_be_settled() {
+    fn any_named_trouble_is_settled() {
         for about in ["", "a".repeat(200).as_str(), "a\u{202E}b"] {
             let mut register = TroubleRegister::default();
             register.note(TroubleKind::BrokerRefuses, Some(about), "refused", at(0));
@@ -666,7 +666,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_has_a_name_of_its_own_a_remedy_that_fits_and_a_line_in_the_manual() {
+    fn every_kind_is_documented() {
         let manual = include_str!("../docs/troubleshooting.md");
         let testing = include_str!("../TESTING.md");
         let (_, tests) = testing.split_once("| kind | test |").unwrap();

@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_drives_on_changes_once_at_each_border() {
+    fn vehicle_changes_once_per_border() {
         let changes = drive(|s| (13.9 * s, 5.0), 43.0);
         let cells: Vec<_> = changes.iter().map(|(_, cell)| cell.clone()).collect();
         assert_eq!(cells, [name(1), name(2)]);
@@ -233,13 +233,13 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_stands_at_a_border_stays_for_an_hour_although_its_position_jumps() {
+    fn border_jumps_change_no_cell() {
         let jumping = |s: f64| (150.0 + 9.0 * (s * 7.3).sin(), 9.0 * (s * 3.1).cos());
         assert_eq!(drive(jumping, 3600.0), []);
     }
 
     #[test]
-    fn a_vehicle_that_turns_back_stays_and_one_outside_of_all_cells_too() {
+    fn turning_back_keeps_cell() {
         assert_eq!(
             drive(
                 |s| (
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_that_does_not_answer_is_given_up_and_tried_again_later() {
+    fn silent_cell_is_retried_later() {
         let mut choice = CellChoice::new(cells(), name(0));
         let place = at(SPACING_M, 0.0);
         assert_eq!(
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_goes_to_and_fro_joins_once_in_some_seconds() {
+    fn oscillating_vehicle_joins_rarely() {
         let mut choice = CellChoice::new(cells(), name(0));
         let places = [at(SPACING_M, 0.0), at(0.0, 0.0)];
         let moves = (0..100)
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_high_above_the_sea_changes_cells_too() {
+    fn height_does_not_block_change() {
         let mut choice = CellChoice::new(cells(), name(0));
         let place = GeographicPosition {
             height_m: 1500.0,
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn the_other_side_of_the_earth_is_far_away() {
+    fn antipode_is_far_away() {
         let mut choice = CellChoice::new(cells(), name(2));
         let place = GeographicPosition {
             latitude_deg: -52.2,
@@ -324,7 +324,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn one_cell_at_a_time_is_joined(places in prop::collection::vec((-400.0..1000.0, -300.0..300.0, 0.0..20.0), 1..60)) {
+        fn one_cell_is_joined_at_once(places in prop::collection::vec((-400.0..1000.0, -300.0..300.0, 0.0..20.0), 1..60)) {
             let mut choice = CellChoice::new(cells(), name(0));
             let mut now_s = 0.0;
             let mut joined = None;

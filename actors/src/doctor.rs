@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_node_that_can_run_has_nothing_broken() {
+    async fn runnable_node_passes_all_checks() {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();
         config.state_dir = Some(directory.path().into());
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_private_key_is_for_the_node_and_the_programs_beside_it() {
+    async fn unprotected_key_is_doubtful() {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();
         let files = certificates(&config, directory.path());
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_certificate_of_another_ca_or_a_revoked_one_is_broken() {
+    async fn foreign_or_revoked_certificate_is_broken() {
         let directory = tempfile::tempdir().unwrap();
         let elsewhere = tempfile::tempdir().unwrap();
         let mut config = config();
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_revocation_list_without_a_list_is_named() {
+    async fn empty_revocation_list_is_named() {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();
         let files = certificates(&config, directory.path());
@@ -311,8 +311,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_door_that_cannot_listen_where_it_is_told_to_is_broken_and_a_free_port_will_do_otherwise()
-     {
+    async fn unusable_listener_address_is_broken() {
         let port = TcpListener::bind("127.0.0.1:0").unwrap();
         let cav = NodeConfig {
             role: Role::Cav,
@@ -350,7 +349,7 @@ mod tests {
 
     #[cfg(feature = "camera")]
     #[tokio::test]
-    async fn a_pose_port_in_use_is_named() {
+    async fn busy_pose_port_is_named() {
         let taken = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut config = config();
         config.pose.listen = taken.local_addr().ok();
@@ -362,8 +361,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for()
-     {
+    async fn replaceable_page_port_is_fine() {
         // The port is in use, by this test or by another.
         let _taken = TcpListener::bind(crate::observe::dashboard::DEFAULT_ADDRESS);
         let mut config = config();
@@ -379,7 +377,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_floor_plan_that_is_not_there_is_broken() {
+    async fn missing_floor_plan_is_broken() {
         let mut config = config();
         let point = |metres: f64| FloorPlanPoint {
             pixel: [metres; 2],
@@ -409,7 +407,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_file_of_cells_that_cannot_be_used_is_broken() {
+    async fn unusable_cells_file_is_broken() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("cells.toml");
         std::fs::write(
@@ -425,7 +423,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_cell_whose_files_are_missing_is_doubtful() {
+    async fn missing_cell_files_are_doubtful() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("cells.toml");
         let cell = |name, more| {
@@ -444,7 +442,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_cell_that_does_not_accept_the_nodes_certificate_is_doubtful() {
+    async fn cell_refusing_certificate_is_doubtful() {
         let directory = tempfile::tempdir().unwrap();
         let elsewhere = tempfile::tempdir().unwrap();
         let own = certificates(&config(), directory.path());
@@ -474,7 +472,7 @@ mod tests {
 
     #[cfg(feature = "foxglove")]
     #[tokio::test]
-    async fn a_live_port_in_use_is_named() {
+    async fn busy_live_port_is_named() {
         let live = TcpListener::bind("127.0.0.1:0").unwrap();
         let directory = tempfile::tempdir().unwrap();
         let live_port = Some(live.local_addr().unwrap().port());
@@ -490,7 +488,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn addresses_of_elsewhere_and_logs_without_a_directory_are_named() {
+    async fn foreign_addresses_and_missing_directories_named() {
         let mut config = config();
         config.listen = Some("192.0.2.1:1883".parse().unwrap());
         config.map_log = Some("/no/such/maps".into());
@@ -507,7 +505,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_external_broker_must_be_there() {
+    async fn external_broker_must_be_reachable() {
         let address = TcpListener::bind("127.0.0.1:0")
             .unwrap()
             .local_addr()
@@ -520,7 +518,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_region_that_is_not_there_is_doubtful() {
+    async fn missing_region_is_doubtful() {
         let address = TcpListener::bind("127.0.0.1:0")
             .unwrap()
             .local_addr()
@@ -535,7 +533,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_seed_without_an_address_is_doubtful() {
+    async fn seed_without_address_is_doubtful() {
         let mut config = config();
         config.role = Role::Cav;
         let seeds = ["127.0.0.1:17884", "[::1]:17884", "egde.invalid:17884"].map(str::to_owned);
@@ -581,7 +579,7 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-    async fn the_cell_is_looked_at_with_the_key() {
+    async fn cell_is_checked_with_key() {
         let (edge, mut config) = edge_and_seeded("correct horse battery").await;
         let found = finding(&config, "cell").await;
         assert!(
@@ -610,7 +608,7 @@ mod tests {
     /// A log may be written by any user who tries, but not by the service, whose unit restricts its
     /// paths.
     #[tokio::test]
-    async fn what_the_unit_does_not_let_the_service_write_is_doubtful() {
+    async fn unwritable_unit_directory_is_doubtful() {
         let unit = include_str!("../../packaging/systemd/ecod-node.service");
         for line in [
             "ProtectSystem=strict",
@@ -651,7 +649,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn keys_and_directories_that_cannot_be_used_are_named() {
+    async fn unusable_keys_and_directories_are_named() {
         let directory = tempfile::tempdir().unwrap();
         let short = directory.path().join("key");
         let file = directory.path().join("file");

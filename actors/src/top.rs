@@ -504,7 +504,7 @@ mod tests {
     }
 
     #[test]
-    fn the_leader_the_places_and_the_nodes_are_seen() {
+    fn leader_and_nodes_are_shown() {
         let text = shown(&mut view(Timestamp(7_200_000)), 100, 30);
         for part in [
             "cell lot-1",
@@ -529,7 +529,7 @@ mod tests {
     }
 
     #[test]
-    fn troubles_are_told_with_their_remedies() {
+    fn troubles_are_shown_with_remedies() {
         let mut view = view(Timestamp(7_200_000));
         assert!(!shown(&mut view, 100, 40).contains("troubles"));
         let trouble = |n: usize| Trouble {
@@ -552,7 +552,7 @@ mod tests {
     }
 
     #[test]
-    fn an_old_round_is_not_passed_off_as_fresh() {
+    fn old_round_shows_as_stale() {
         assert!(
             shown(&mut view(Timestamp(10_000_000)), 100, 30).contains("newest round 3000 ms old")
         );
@@ -577,7 +577,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_that_only_votes_has_ages_and_history_by_its_verdicts() {
+    fn voting_cell_uses_verdict_age() {
         let verdicts: Verdicts = serde_json::from_value(serde_json::json!({
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0, "verdicts": []
         }))
@@ -609,7 +609,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_out_under_overload_is_counted_among_the_losses() {
+    fn overload_losses_are_counted() {
         let counters = Counters::default();
         for vehicle in ["euclid", "gauss"] {
             counters.shed(ShedReason::ReportReplaced, vehicle);
@@ -629,7 +629,7 @@ mod tests {
     }
 
     #[test]
-    fn what_finds_no_room_is_said_and_scrolled_to() {
+    fn hidden_rows_are_scrollable() {
         // Two locations and an object, and room for two lines.
         let mut view = view(Timestamp(7_200_000));
         let height = 4 + 5 + 9 + 1;
@@ -648,14 +648,14 @@ mod tests {
     }
 
     #[test]
-    fn a_small_terminal_is_no_trouble() {
+    fn small_terminal_is_accepted() {
         for (width, height) in [(1, 1), (20, 5), (40, 12)] {
             shown(&mut view(Timestamp(0)), width, height);
         }
     }
 
     #[test]
-    fn a_cell_without_reports_is_told_the_next_step() {
+    fn empty_cell_shows_next_step() {
         let now = Timestamp(0) + Duration::from_secs(9);
         let mut view = CellView {
             map: None,

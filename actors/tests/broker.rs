@@ -16,7 +16,7 @@ fn threads() -> usize {
 }
 
 #[test]
-fn starts_stops_and_restarts_without_leaving_anything() {
+fn restart_leaks_no_threads() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     assert_eq!(broker.health(), BrokerHealth::Stopped);
     let idle = threads();

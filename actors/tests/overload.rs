@@ -133,7 +133,7 @@ fn shed(edge: &NodeHandle, source: &str) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
+async fn flood_delays_no_other_reports() {
     let _alone = ALONE.lock().await;
     let (edge, broker) = edge(|config| config.broker.max_messages_hz = 500).await;
     let mut tasks = JoinSet::new();
@@ -174,7 +174,7 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
+async fn tenfold_load_keeps_period() {
     let _alone = ALONE.lock().await;
     let (edge, broker) = edge(|config| config.mqtt.max_report_hz = 10).await;
     let mut tasks = JoinSet::new();

@@ -358,7 +358,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn vacancy_signs_are_those_of_the_description() {
+    fn vacancy_signs_come_from_description() {
         let description = "[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\nvacancy = { label = \"EMPTY\", x_m = 0, y_m = 1 }\n\
                            [[landmarks]]\nid = \"b\"\nx_m = 5\ny_m = 0\n";
         assert_eq!(vacancy_signs(description), BTreeSet::from(["EMPTY".into()]));

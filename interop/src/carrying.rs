@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_panic_ends_all_threads_and_is_no_orderly_end() {
+    fn panic_ends_all_threads() {
         let is_closed = AtomicBool::new(false);
         let wait = || {
             while !is_closed.load(Ordering::Relaxed) {
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn all_refusals_are_counted_and_the_powers_of_ten_of_each_kind_are_told() {
+    fn refusals_log_powers_of_ten() {
         let refusals = RefusalCounts::default();
         let told: Vec<_> = (0..1000)
             .chain(0..1000)
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_is_told_once_until_all_is_well() {
+    fn failure_is_reported_once() {
         let failures = Failures::default();
         let told = |name| [failures.begins(name), failures.begins(name)];
         assert_eq!((told("a"), told("b")), ([true, false], [true, false]));

@@ -110,7 +110,7 @@ mod tests {
     const NOW: Timestamp = Timestamp(1_795_239_882_123_000);
 
     #[test]
-    fn a_ghost_is_unlikely_in_ros_and_places_are_drawn() {
+    fn ghost_is_unlikely_and_landmarks_drawn() {
         let ghost = FusedObject {
             scores: [("car".into(), 0.75), ("truck".into(), 0.25)].into(),
             ..FusedObject::new(
@@ -245,7 +245,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_valid_map_and_report_is_messages_that_receivers_decode(
+        fn valid_messages_are_decodable(
             seen in vec(extreme_detection(), 0..8),
             pose in option::of((up_to(1e8), up_to(1e8), -TAU..=TAU)),
             at in prop_oneof![Just(NOW.0), 0..(1u64 << 53)],
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_as_ros_allows_them() {
+    fn names_follow_ros_rules() {
         for (name, expected) in [
             ("lot-1", "lot_1"),
             ("edge--ros2", "edge_ros2"),

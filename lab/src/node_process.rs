@@ -233,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_program_without_a_node_beside_it_says_how_to_get_one() {
+    fn missing_node_program_names_remedy() {
         let error = node_beside(Path::new("/no/such/ecod-lab"))
             .unwrap_err()
             .to_string();

@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cell_writes_below_its_own_tile_and_name_alone() {
+    fn cell_writes_below_its_tile() {
         let origin = GeographicOrigin {
             latitude_deg: 48.8584,
             longitude_deg: 2.2945,

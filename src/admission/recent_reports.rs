@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_comes_by_two_brokers_is_new_once() {
+    fn two_brokers_count_report_once() {
         let mut recent = RecentReports::default();
         let report =
             |seq: u64| ObjectReport::new(NodeName::from_static("euclid"), seq, Timestamp(seq));

@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_trusted_decides_what_is_there_and_pace_whether_anything_is() {
+    fn trust_decides_label_pace_decides_presence() {
         let seen: &[&str] = &["euclid"];
         assert_eq!(
             answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]),
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn the_answer_is_as_sure_as_the_less_sure_of_both() {
+    fn confidence_is_lower_of_both() {
         let seen: &[&str] = &["euclid"];
         assert_eq!(
             answer(state(Some("car"), 0.8, seen), &[("car", 1.0)]).1,

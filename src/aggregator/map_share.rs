@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn one_vehicle_fills_its_share_and_the_objects_of_others_stay() {
+    fn vehicle_fills_only_its_share() {
         let invented =
             (0..5000).map(|number| object(number, 0.2 + 0.0001 * number as f64, &["mallory"]));
         let honest = (5000..5100).map(|number| object(number, 0.01, &["euclid"]));
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn of_equally_certain_objects_the_first_stay() {
+    fn first_of_equals_stays() {
         let mut objects: Vec<_> = (0..2000)
             .map(|number| object(number, 0.5, &["mallory"]))
             .collect();
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn long_texts_take_the_place_of_objects_and_the_estimate_is_close() {
+    fn long_texts_reduce_object_count() {
         let long = "x".repeat(64);
         let wordy = |number| FusedObject {
             label: long.clone().into(),

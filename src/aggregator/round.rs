@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn closes_with_the_last_of_the_live_vehicles() {
+    fn closes_with_last_live_vehicle() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         assert!(!rounds.report(Detections, &node("a"), at(10)));
         assert!(
@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_sends_both_kinds_is_waited_for_with_both() {
+    fn both_report_kinds_are_awaited() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         rounds.report(Detections, &node("a"), at(10));
         rounds.report(VoteDetections, &node("a"), at(11));
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_of_rounds_starts_in_step_a_period_later_or_at_once() {
+    fn first_round_follows_mode() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         rounds.start(FirstRound::InStep, at(50));
         assert_eq!(rounds.deadline(), at(100));
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn who_connects_late_to_an_unplanned_leader_does_not_wait_for_a_period() {
+    fn late_connection_waits_no_period() {
         for (first, expected) in [
             (FirstRound::Overdue, [50, 75, 125, 225, 325]),
             (FirstRound::AfterConnects, [75, 100, 150, 250, 350]),
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn the_period_bounds_the_wait_for_a_silent_vehicle() {
+    fn period_bounds_wait() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         rounds.report(Detections, &node("a"), at(1));
         rounds.report(Detections, &node("b"), at(2));
@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_left_is_not_waited_for() {
+    fn departed_vehicle_is_not_awaited() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         rounds.report(Detections, &node("gone"), at(0));
         for round in 1..=4 {
@@ -393,7 +393,7 @@ mod tests {
 
     /// Two reports a second of each of seven cameras, which capture together.
     #[test]
-    fn cameras_that_report_less_often_than_rounds_close_share_a_round() {
+    fn slow_cameras_share_round() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         for frame in 1..8 {
             let capture = at(frame * 500);
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn one_slow_vehicle_does_not_hold_up_rounds_in_which_it_has_nothing_to_report() {
+    fn slow_vehicle_delays_few_rounds() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         let mut slow = 0;
         for ms in (1..5000).step_by(100) {
@@ -438,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_that_come_once_a_period_are_waited_for_at_its_end() {
+    fn periodic_reports_are_awaited() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         for name in ["a", "b"] {
             rounds.report(Detections, &node(name), at(1));
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn vehicles_that_the_end_of_the_period_left_out_have_a_round_of_their_own() {
+    fn vehicles_left_out_get_extra_round() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         for name in ["a", "b", "c"] {
             rounds.report(Detections, &node(name), at(1));
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_that_end_in_the_midst_of_reports_end_after_them_from_then_on() {
+    fn round_end_moves_after_reports() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         // The first vehicle is alone when it reports, and completes its round at once.
         assert!(rounds.report(Detections, &node("a"), at(50)));
@@ -506,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn one_fast_vehicle_does_not_drive_the_rate() {
+    fn fast_vehicle_sets_no_rate() {
         let mut rounds = trigger(RoundClose::WhenComplete);
         let closed = (0..1000)
             .filter(|ms| rounds.report(Detections, &node("a"), at(*ms)))
@@ -518,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn a_round_that_is_held_lasts_its_period() {
+    fn held_round_lasts_full_period() {
         let start = Timestamp(1_000_000);
         let mut rounds = RoundTrigger::new(RoundConfig::default(), start);
         let euclid = NodeName::from_static("euclid");

@@ -59,7 +59,7 @@ fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
 }
 
 #[test]
-fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
+fn expelled_vehicles_objects_leave_map() {
     let tracks = TracksConfig {
         mode: TracksMode::On,
         ..TracksConfig::default()
@@ -125,7 +125,7 @@ fn what_an_expelled_vehicle_alone_reported_leaves_the_map_at_once() {
 }
 
 #[test]
-fn votes_of_an_expelled_vehicle_no_longer_count() {
+fn expelled_vehicles_votes_stop_counting() {
     let round = RoundConfig {
         close: RoundClose::Periodic,
         ..RoundConfig::default()
@@ -161,7 +161,7 @@ fn votes_of_an_expelled_vehicle_no_longer_count() {
 }
 
 #[test]
-fn vehicles_that_are_expelled_one_after_the_other_leave_no_common_object() {
+fn successive_expulsions_remove_shared_object() {
     let mut cell = leader(FusionConfig {
         tracks: TracksConfig {
             mode: TracksMode::On,
@@ -209,7 +209,7 @@ fn vehicles_that_are_expelled_one_after_the_other_leave_no_common_object() {
 }
 
 #[test]
-fn a_round_is_closed_for_map_and_verdicts_together() {
+fn map_and_verdicts_close_together() {
     let round = RoundConfig {
         close: RoundClose::Periodic,
         ..RoundConfig::default()
@@ -248,7 +248,7 @@ fn a_round_is_closed_for_map_and_verdicts_together() {
 }
 
 #[test]
-fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
+fn frame_counts_once_per_kind() {
     let mut cell = leader(FusionConfig::default());
     let frame = report("euclid", "cup", 10);
     assert_eq!(cell.report(Detections, &frame, at(12)), Ok(None));
@@ -267,7 +267,7 @@ fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
 }
 
 #[test]
-fn a_cell_refuses_reports_for_what_it_does_not_run() {
+fn reports_for_disabled_algorithm_refused() {
     for (algorithms, kind, other) in [
         (Algorithms::Pace, Detections, VoteDetections),
         (Algorithms::Vote, VoteDetections, Detections),
@@ -291,7 +291,7 @@ fn a_cell_refuses_reports_for_what_it_does_not_run() {
 }
 
 #[test]
-fn where_both_run_verdicts_come_from_the_first_vote_on() {
+fn verdicts_start_with_first_vote() {
     let mut cell = leader(FusionConfig::default());
     cell.report(Detections, &report("euclid", "cup", 10), at(12))
         .unwrap();
@@ -307,7 +307,7 @@ fn where_both_run_verdicts_come_from_the_first_vote_on() {
 }
 
 #[test]
-fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
+fn standby_leads_with_its_state() {
     let mut cell = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     for step in 1..=20 {
         for kind in [Detections, VoteDetections] {
@@ -349,7 +349,7 @@ fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
 }
 
 #[test]
-fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
+fn paper_verdicts_follow_packets() {
     let vote = VoteConfig {
         mode: VoteMode::Paper,
         ..VoteConfig::default()
@@ -382,7 +382,7 @@ fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
 }
 
 #[test]
-fn settled_votes_become_evidence_that_another_aggregator_adopts() {
+fn settled_votes_become_adopted_evidence() {
     let config = FusionConfig {
         round: RoundConfig {
             period_s: 0.5,
@@ -450,7 +450,7 @@ fn settled(
 }
 
 #[test]
-fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
+fn open_votes_settle_on_one_side() {
     let mut edge = leader(FusionConfig::default());
     let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     for step in 1..10u64 {
@@ -481,7 +481,7 @@ fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
 }
 
 #[test]
-fn what_is_said_to_a_new_leader_is_its_evidence() {
+fn new_leader_counts_later_votes() {
     let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     let before = settled(&mut standby, &["euclid", "gauss"], (100, 1000));
     assert!(before.is_empty());
@@ -500,7 +500,7 @@ fn what_is_said_to_a_new_leader_is_its_evidence() {
 }
 
 #[test]
-fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds() {
+fn untimely_vehicle_deposes_no_leader() {
     let mut cell = leader(FusionConfig::default());
     let mut last = Timeliness::default();
     for n in 0..100 {
@@ -523,7 +523,7 @@ fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds(
 }
 
 #[test]
-fn the_parts_of_a_vehicle_are_one_witness() {
+fn vehicle_parts_are_one_witness() {
     let mut cell = leader(FusionConfig::default());
     for (n, part) in (0..).zip(["euclid", "euclid--lidar", "euclid--radar", "gauss"]) {
         let label = if part == "gauss" { "car" } else { "cup" };
@@ -559,7 +559,7 @@ fn the_parts_of_a_vehicle_are_one_witness() {
 /// Frames of a slower camera are older than frames of a faster camera that arrived earlier, and the
 /// slower camera has sent fewer.
 #[test]
-fn the_cameras_of_a_vehicle_may_overtake_one_another() {
+fn cameras_of_vehicle_may_overtake() {
     let mut cell = leader(FusionConfig::default());
     for n in 1..=5 {
         for (camera, captured_ms) in [("euclid", n * 100), ("euclid--rear", n * 100 - 40)] {

@@ -49,7 +49,7 @@ fn publishes(effects: &[DescriptionEffect]) -> bool {
 }
 
 #[test]
-fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
+fn body_needs_statement_of_candidate() {
     let new = described(1, "new");
     for is_body_first in [true, false] {
         let mut euclid = node("euclid");
@@ -92,7 +92,7 @@ fn candidates(stamp: DescriptionStamp) -> DescriptionStatement {
 }
 
 #[test]
-fn one_candidate_that_is_no_operators_does_not_change_the_cell_and_two_pass_a_description_on() {
+fn one_candidate_changes_no_description() {
     let saved = DescriptionHistory::of(Some(described(1, "right")));
     let mut euclid = DescriptionExchange::new(name("euclid"), true, saved);
     let new = described(2, "new");
@@ -113,7 +113,7 @@ fn one_candidate_that_is_no_operators_does_not_change_the_cell_and_two_pass_a_de
 }
 
 #[test]
-fn a_node_without_a_description_gets_it_from_its_leader_while_the_operators_node_is_away() {
+fn leader_supplies_missing_description() {
     let mut euclid = node("euclid");
     let right = described(6, "right");
     euclid.take(Arc::clone(&right), at(0));
@@ -127,7 +127,7 @@ fn a_node_without_a_description_gets_it_from_its_leader_while_the_operators_node
 }
 
 #[test]
-fn all_agree_after_a_split_in_whatever_order_they_meet() {
+fn merge_order_does_not_matter() {
     let sides = [
         described(3, "a"),
         described(4, "b"),
@@ -147,7 +147,7 @@ fn all_agree_after_a_split_in_whatever_order_they_meet() {
 }
 
 #[test]
-fn a_change_here_is_the_next_version_and_goes_out_at_once() {
+fn local_change_is_published() {
     let mut euclid = DescriptionExchange::new(
         name("euclid"),
         true,
@@ -182,7 +182,7 @@ fn a_change_here_is_the_next_version_and_goes_out_at_once() {
 }
 
 #[test]
-fn a_version_far_ahead_is_counted_and_changes_nothing() {
+fn version_far_ahead_is_ignored() {
     let mut euclid = DescriptionExchange::new(
         name("euclid"),
         true,
@@ -207,7 +207,7 @@ fn a_version_far_ahead_is_counted_and_changes_nothing() {
 }
 
 #[test]
-fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
+fn settable_version_suits_all() {
     let held = described(6, "old");
     let [mut euclid, mut gauss] = ["euclid", "gauss"].map(|own| {
         DescriptionExchange::new(
@@ -228,7 +228,7 @@ fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
 }
 
 #[test]
-fn who_was_away_for_long_takes_the_leaders() {
+fn absent_node_adopts_leaders_version() {
     let far = described(6 + 3 * MAX_VERSION_STEP, "far");
     let mut euclid = DescriptionExchange::new(
         name("euclid"),
@@ -246,7 +246,7 @@ fn who_was_away_for_long_takes_the_leaders() {
 }
 
 #[test]
-fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
+fn adoptions_are_limited_per_second() {
     let mut euclid = node("euclid");
     let mut adopted = 0;
     for version in 1..=100 {
@@ -261,7 +261,7 @@ fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
 }
 
 #[test]
-fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
+fn leader_repeats_only_while_needed() {
     let held = described(3, "held");
     let mut edge = DescriptionExchange::new(
         name("edge"),
@@ -289,7 +289,7 @@ fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
 }
 
 #[test]
-fn a_node_that_never_has_it_costs_the_others_little() {
+fn outdated_node_costs_little() {
     let mut edge = DescriptionExchange::new(
         name("edge"),
         true,
@@ -313,7 +313,7 @@ fn a_node_that_never_has_it_costs_the_others_little() {
 }
 
 #[test]
-fn a_candidate_that_does_not_lead_tells_a_leader_that_is_behind() {
+fn candidate_informs_outdated_leader() {
     let held = described(3, "held");
     let mut euclid = DescriptionExchange::new(
         name("euclid"),
@@ -353,7 +353,7 @@ fn a_candidate_that_does_not_lead_tells_a_leader_that_is_behind() {
 }
 
 #[test]
-fn bodies_that_nobody_states_take_bounded_room() {
+fn unstated_bodies_are_bounded() {
     let mut euclid = node("euclid");
     let stated = described(1, "stated");
     euclid.take(Arc::clone(&stated), at(0));
@@ -374,7 +374,7 @@ fn certified(certificate: &str, stamp: DescriptionStamp) -> DescriptionStatement
 const EMPTY: ContentHash = ContentHash([0xee; 32]);
 
 #[test]
-fn a_description_goes_with_the_certificate_of_the_candidate_that_made_it() {
+fn revoked_certificate_removes_its_description() {
     let right = described(6, "right");
     let mut edge = DescriptionExchange::new(
         name("edge"),
@@ -434,7 +434,7 @@ fn a_description_goes_with_the_certificate_of_the_candidate_that_made_it() {
 }
 
 #[test]
-fn a_burst_of_descriptions_does_not_delay_the_right_one_after_the_revocation() {
+fn burst_does_not_delay_recovery() {
     let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
     for version in 1..=MAX_ADOPTIONS as u64 {
         let forged = described(version, "false");
@@ -452,7 +452,7 @@ fn a_burst_of_descriptions_does_not_delay_the_right_one_after_the_revocation() {
 }
 
 #[test]
-fn without_an_earlier_description_the_nodes_own_settings_count_again() {
+fn node_settings_are_restored() {
     let mut edge = node("edge");
     let forged = described(7, "false");
     edge.hear(
@@ -486,7 +486,7 @@ fn without_an_earlier_description_the_nodes_own_settings_count_again() {
 }
 
 #[test]
-fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
+fn one_certificate_displaces_no_predecessor() {
     let mut edge = DescriptionExchange::new(
         name("edge"),
         true,
@@ -509,7 +509,7 @@ fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
 /// A node that starts late receives statements of all candidates, so a single revoked candidate
 /// does not make it go back.
 #[test]
-fn a_description_stays_when_one_of_those_that_pass_it_on_is_revoked() {
+fn revoking_one_relay_keeps_description() {
     let right = described(6, "right");
     let mut late = node("gauss");
     for candidate in ["alpha", "edge", "turing"] {

@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_member_that_stops_answering_is_missing_until_it_returns() {
+    fn silent_member_is_missing() {
         let mut expected = ExpectedNodes::default();
         check(
             &mut expected,
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_leaves_in_order_is_not_missing_although_it_answers_a_moment_longer() {
+    fn leaving_node_is_not_missing() {
         let mut expected = ExpectedNodes::default();
         check(&mut expected, &[(EUCLID, Role::Auto)], at(1));
         expected.receive(&farewell(EUCLID), at(1));
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_returns_at_once_after_it_has_left_is_expected_again() {
+    fn returning_node_is_expected_again() {
         let mut expected = ExpectedNodes::default();
         check(&mut expected, &[(EUCLID, Role::Auto)], at(1));
         expected.receive(&farewell(EUCLID), at(1));
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_passes_through_is_not_missing_when_it_is_gone() {
+    fn passing_vehicle_is_not_missing() {
         let mut expected = ExpectedNodes::default();
         check(&mut expected, &[(EUCLID, Role::Cav)], at(1));
         expected.receive(&dismissing(EUCLID, EUCLID), at(1));
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn an_operator_dismisses_a_missing_node_for_the_cell_until_it_returns() {
+    fn dismissal_lasts_until_return() {
         let mut here = ExpectedNodes::default();
         let mut there = ExpectedNodes::default();
         check(
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_does_not_hide_that_another_node_is_missing_nor_a_present_one() {
+    fn vehicle_hides_no_missing_node() {
         let mut expected = ExpectedNodes::default();
         let present = [(EDGE, Role::Edge), (EUCLID, Role::Auto), (GAUSS, Role::Cav)];
         check(&mut expected, &present, at(1));

@@ -90,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_are_valid_and_errors_name_the_key() {
+    fn defaults_are_valid_errors_name_key() {
         assert_eq!(ElectionConfig::default().validate(), Ok(()));
         let wrong = ElectionConfig {
             idle_beat_ms: 20,

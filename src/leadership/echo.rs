@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn many_messages_over_some_time_without_an_answer_are_a_stall() {
+    fn unanswered_messages_are_stall() {
         assert_eq!(stalled_at((0..).step_by(100)), Some(800));
         assert_eq!(
             stalled_at((0..700).step_by(1)),
@@ -63,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_comes_in_begins_the_count_anew() {
+    fn any_message_resets_count() {
         let mut echo = EchoMonitor::default();
         assert!((0..100).all(|n| !echo.note_sent(n / 5, Timestamp(n * 150_000))));
     }

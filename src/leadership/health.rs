@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn only_an_established_link_that_broke_proves_its_process_gone() {
+    fn only_broken_established_link_proves_death() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         let broker = address(1);
         assert!(
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_is_fit_while_broker_link_and_rounds_work() {
+    fn fit_node_has_broker_and_rounds() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let plane = DataPlane {
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_was_stopped_does_not_blame_its_fuser() {
+    fn stopped_node_blames_no_fuser() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let fuser = |monitor: &HealthMonitor| {
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_with_unusable_reports_settings_or_certificate_makes_way_if_another_could_lead() {
+    fn unfit_leader_yields_to_alternative() {
         let plane = DataPlane {
             external: None,
             embedded: true,
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_came_up_unnoticed_is_found_by_asking() {
+    fn unnoticed_link_is_found_by_query() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let plane = DataPlane {
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broker_that_passes_nothing_on_is_none_unless_nobody_else_could_lead() {
+    fn nonrelaying_broker_is_unfit_with_alternative() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let brokers = Brokers {
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn an_external_broker_makes_up_for_a_private_one_only_while_it_is_there() {
+    fn external_broker_substitutes_if_connected() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         let plane = DataPlane {
             external: Some(address(9)),
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broker_that_is_no_longer_used_is_no_login() {
+    fn unused_broker_is_no_login() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         monitor.note_link(&address(1), LinkState::Up);
         monitor.note_link(&address(2), LinkState::Up);
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn with_an_external_broker_its_link_counts_and_with_both_either() {
+    fn external_or_embedded_link_counts() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let brokers = Brokers {

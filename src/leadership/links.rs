@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_outlives_a_change_of_leader_for_a_while() {
+    fn link_survives_leader_change_briefly() {
         let mut links = Links::new(DataPlane {
             external: None,
             embedded: true,
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn an_external_broker_is_used_alone_or_beside_the_others() {
+    fn external_broker_is_exclusive_or_additional() {
         let external = Some(broker(9));
         let mut alone = Links::new(DataPlane {
             external: external.clone(),
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_are_taken_from_the_own_broker_and_the_external_one() {
+    fn embedded_and_external_brokers_supply_reports() {
         let mut links = Links::new(DataPlane {
             external: Some(broker(9)),
             embedded: true,

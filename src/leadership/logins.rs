@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn a_login_is_missing_after_two_seconds_and_back_after_as_many() {
+    fn missing_login_needs_two_seconds() {
         let mut logins = Logins::default();
         assert_eq!(looks(&mut logins, false), Some(8));
         assert_eq!(logins.missing().count(), 1);
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broker_that_is_reached_now_and_then_is_not_missing() {
+    fn intermittent_broker_is_not_missing() {
         let mut logins = Logins::default();
         let look =
             |look: usize| BTreeMap::from([(NodeName::from_static("edge"), look.is_multiple_of(7))]);
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_logins_are_missing_than_a_message_holds() {
+    fn missing_logins_fit_message() {
         let mut logins = Logins::default();
         let names = (0..10).map(|number| (NodeName::new(format!("n{number}")).unwrap(), false));
         let brokers = names.collect();

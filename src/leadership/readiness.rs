@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn ready_means_fresh_rounds_of_the_leader_and_a_broker_to_lead_with() {
+    fn ready_needs_rounds_and_broker() {
         let at = |position| Leadership {
             position,
             epoch: Some(epoch(4)),
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_lets_nobody_in_is_not_ready_and_is_not_restarted_for_it() {
+    fn refused_logins_cause_no_restart() {
         let leading = Leadership {
             position: Position::Leading,
             epoch: Some(epoch(4)),
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_problem_of_settings_is_told_first_and_restarts_nothing() {
+    fn settings_problem_comes_first_without_restart() {
         let following = Leadership {
             position: Position::Following,
             epoch: Some(epoch(4)),
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cause_is_told_where_a_node_is_not_ready() {
+    fn unready_node_names_cause() {
         let told = |leadership: &Leadership| {
             let judged = Readiness::judge(leadership, None, false, None, Timestamp(0));
             judged
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_that_come_with_packets_only_are_not_waited_for() {
+    fn packet_rounds_are_not_awaited() {
         let following = Leadership {
             position: Position::Following,
             epoch: Some(epoch(4)),

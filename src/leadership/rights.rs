@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nobody_may_declare_more_than_the_certificate_says() {
+    fn declaration_beyond_certificate_is_refused() {
         let auto = Rights {
             priority: 100,
             ..Rights::from(Role::Auto)

@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_huge_epoch_silences_the_others_for_a_moment_only() {
+    fn huge_epoch_silences_others_briefly() {
         let mut filter = RoundFilter::new(0, ms(0));
         let seeking = seeking();
         let mut take =
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_that_waited_while_the_node_was_stopped_are_not_taken() {
+    fn queued_rounds_are_refused() {
         let mut filter = RoundFilter::new(0, ms(0));
         let seeking = seeking();
         let at = |round: u64| ms(100 * round);
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_refused_map_does_not_make_old_ones_look_fresh() {
+    fn refused_map_refreshes_no_others() {
         let mut filter = RoundFilter::new(0, ms(0));
         let leadership = following(8, "edge");
         let at = |round: u64| ms(100 * round);
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
+    fn each_topic_has_separate_order() {
         let mut filter = RoundFilter::new(0, Timestamp(1));
         let seeking = seeking();
         let now = Timestamp(1);
@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
+    fn lone_deposed_leader_is_refused() {
         let mut filter = RoundFilter::new(0, ms(0));
         let leadership = following(8, "euclid");
         assert_eq!(
@@ -406,7 +406,7 @@ mod tests {
     }
 
     #[test]
-    fn verdicts_are_signs_of_life_only_where_no_maps_come() {
+    fn verdicts_are_life_signs_without_maps() {
         let mut filter = RoundFilter::new(0, ms(0));
         let leadership = following(8, "edge");
         let verdicts = |round: u64| Verdicts {
@@ -443,7 +443,7 @@ mod tests {
     }
 
     #[test]
-    fn a_term_that_no_election_knows_is_accepted_and_not_gone_on_from() {
+    fn unknown_term_is_accepted_not_continued() {
         let mut filter = RoundFilter::new(0, ms(0));
         let next = filter
             .accept_map(&map(8, 1, ms(0)), Origin::Claimed, ms(0), &seeking())
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_proves_its_rounds_is_not_heard_without_proof() {
+    fn signing_leader_needs_signature_always() {
         let mut filter = RoundFilter::new(0, ms(0));
         let leadership = following(8, "edge");
         let mut take = |epoch, round: u64, origin, leadership: &Leadership| {

@@ -280,7 +280,7 @@ mod tests {
 
     /// Every line of the table above.
     #[test]
-    fn every_timer_keeps_its_relation_to_the_others() {
+    fn timers_keep_their_relations() {
         let config = ElectionConfig::default();
         let round = Duration::from_secs_f64(RoundConfig::default().period_s);
         let stall = Duration::from_millis(config.stall_ms);

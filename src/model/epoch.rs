@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn epochs_order_by_term_then_leader() {
+    fn epochs_order_by_term_first() {
         assert!(epoch(2, "a") > epoch(1, "z"));
         assert!(epoch(2, "b") > epoch(2, "a"));
     }

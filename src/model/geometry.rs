@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wraps_across_north_and_the_cut() {
+    fn heading_wraps_at_north() {
         assert!(
             (wrap_angle(359f64.to_radians() - 1f64.to_radians()) - (-2f64).to_radians()).abs()
                 < 1e-12
@@ -166,14 +166,14 @@ mod tests {
     }
 
     #[test]
-    fn a_line_of_sight_covariance_is_long_along_the_sight() {
+    fn sight_covariance_is_longest_along_sight() {
         let c = Covariance::along_bearing(std::f64::consts::FRAC_PI_2, 2.0, 0.5);
         assert!((c.xx - 0.25).abs() < 1e-12 && (c.yy - 4.0).abs() < 1e-12 && c.xy.abs() < 1e-12);
         assert!(c.is_valid());
     }
 
     #[test]
-    fn rounding_makes_no_covariance_invalid_and_more_than_rounding_does() {
+    fn rounding_keeps_covariance_valid() {
         for step in 1..1000 {
             let xx = 1e-6 * f64::from(step);
             let yy = 0.003 * f64::from(step) / 7.0;
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn ahead_and_left_are_as_the_pose_has_them() {
+    fn ahead_and_left_invert_pose_transform() {
         let pose = Pose::new(3.0, -1.0, 2.0);
         assert!(
             (pose.ahead_left(&pose.transform(4.0, -0.5)) - Vector2::new(4.0, -0.5)).norm() < 1e-12
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn bearing_is_relative_to_the_heading() {
+    fn bearing_is_relative_to_heading() {
         let pose = Pose::new(1.0, 1.0, 3.0);
         let (range, bearing) = pose.range_bearing(&pose.transform(3.0, 4.0));
         assert!((range - 5.0).abs() < 1e-12);

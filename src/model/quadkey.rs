@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_those_of_the_tile_system() {
+    fn keys_match_tile_system() {
         // Microsoft's example: tile (3, 5) of level 3 has the key 213.
         let tile = Quadkey {
             digits: 3,
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tile_contains_its_quarters_and_nothing_beside_it() {
+    fn tile_contains_exactly_its_quarters() {
         let [outer, inner, beside] =
             ["213", "21302", "2120"].map(|key| key.parse::<Quadkey>().unwrap());
         assert!(
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_within_the_corners_of_its_tile_and_near_its_neighbours() {
+    fn position_is_inside_tile_near_neighbours() {
         for (latitude, longitude) in [
             (48.85, 2.29),
             (-33.9, 151.2),

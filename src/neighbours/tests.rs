@@ -111,7 +111,7 @@ fn live(neighbours: &mut Neighbours, from: u64, to: u64) {
 }
 
 #[test]
-fn objects_are_where_they_are_on_earth() {
+fn objects_keep_positions_on_earth() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let theirs = FusedObject {
@@ -156,7 +156,7 @@ fn objects_are_where_they_are_on_earth() {
 }
 
 #[test]
-fn a_cell_tells_of_its_own_tile_and_what_is_near_it() {
+fn only_tile_and_nearby_objects_pass() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let objects = vec![
@@ -190,7 +190,7 @@ fn a_cell_tells_of_its_own_tile_and_what_is_near_it() {
 }
 
 #[test]
-fn more_objects_than_there_is_room_for_are_counted_and_the_nearest_stay() {
+fn nearest_objects_fit_first() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let crowd = (0..2000).map(|number| object(number, 0.0, -0.02 * number as f64));
@@ -213,7 +213,7 @@ fn more_objects_than_there_is_room_for_are_counted_and_the_nearest_stay() {
 }
 
 #[test]
-fn maps_count_in_the_order_of_epoch_and_round() {
+fn maps_order_by_epoch_and_round() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let mut taken = |epoch, leader, round, at| {
@@ -228,7 +228,7 @@ fn maps_count_in_the_order_of_epoch_and_round() {
 }
 
 #[test]
-fn a_jump_of_the_cells_time_costs_no_map() {
+fn time_jump_costs_no_map() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     for (round, jump_us) in [
@@ -251,7 +251,7 @@ fn a_jump_of_the_cells_time_costs_no_map() {
 /// A minute without a link, in which the lead moves; then all that was sent meanwhile comes within
 /// two seconds.
 #[test]
-fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
+fn delayed_maps_are_dropped() {
     for knows_before in [true, false] {
         let mut neighbours = home();
         if knows_before {
@@ -337,7 +337,7 @@ fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
 }
 
 #[test]
-fn a_backlog_of_nearly_all_cells_is_no_clock_for_some_minutes() {
+fn common_backlog_is_no_clock() {
     let [none, all] = [[0; 4], [120; 4]];
     assert_eq!(late_for_long(4, |_| 0), [all, all]);
     assert_eq!(late_for_long(4, |_| 2000), [none, all], "all are late");
@@ -372,7 +372,7 @@ fn a_silent_cell_is_forgotten() {
 }
 
 #[test]
-fn a_cell_beyond_the_bound_is_refused_until_another_is_silent() {
+fn excess_cell_waits_for_silent_one() {
     let mut filter = CellMapFilter::new(1);
     let admit = |filter: &mut CellMapFilter, cell: &str, at: u64| {
         let message = CellMap {
@@ -399,7 +399,7 @@ proptest! {
     /// With any delays, duplicates and reordering, each map is used at most once and while it is
     /// recent, and each object appears once.
     #[test]
-    fn no_order_of_messages_makes_a_map_old_or_an_object_double(
+    fn any_order_keeps_objects_unique(
         delays in vec((0_u64..10, 0_u64..10_000, any::<bool>()), 200),
         offset_us in -10_000_000_i64..10_000_000,
     ) {
@@ -434,7 +434,7 @@ proptest! {
 }
 
 #[test]
-fn whatever_a_neighbour_tells_receivers_of_the_own_map_can_read_it() {
+fn neighbour_objects_keep_map_readable() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let origin = beside(200.0, 45.0);
@@ -490,7 +490,7 @@ fn whatever_a_neighbour_tells_receivers_of_the_own_map_can_read_it() {
 }
 
 #[test]
-fn a_forged_epoch_shuts_a_lone_neighbour_out_for_a_minute_only() {
+fn forged_epoch_blocks_one_minute() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     neighbours

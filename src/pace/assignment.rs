@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loser_of_a_contest_takes_its_second_choice() {
+    fn contest_loser_takes_second_choice() {
         assert_eq!(
             assigned(&[vec![(0, 1), (1, 9)], vec![(0, 4), (1, 5)]]),
             [(0, 0), (1, 1)]
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_contest_is_settled_for_the_good_of_all() {
+    fn contest_minimises_total_cost() {
         let row = [vec![(0, 4)], vec![(0, 3), (1, 4)], vec![(1, 2), (2, 4)]];
         assert_eq!(
             assigned(&row),
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_has_no_place_left_is_left_out() {
+    fn surplus_detection_stays_unassigned() {
         assert_eq!(
             assigned(&[vec![(3, 5)], vec![(3, 1)], vec![(3, 2)]]),
             [(1, 3)]
@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_keep_their_places_in_an_enormous_contest() {
+    fn nearest_win_in_enormous_contest() {
         let count = 2 * MAX_CONTEST as u32;
         let crowd: Vec<_> = (0..count)
             .flat_map(|n| [vec![(n, 1), (n + 1, 3)], vec![(n, 2), (n + 1, 4)]])

@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_has_the_place_of_its_object_and_its_landmark() {
+    fn box_has_position_and_landmark() {
         let boxes = report(vec![person(0.2, 0.1)]);
         assert!(boxes.check(&Limits::default()).is_ok());
         let ProjectedBoxes { report, unplaced } = projector().project(&boxes);
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_has_the_position_and_covariance_that_the_nodes_own_camera_gives() {
+    fn box_matches_node_camera() {
         let boxes = report(vec![found("person", [600.0, 300.0, 660.0, 480.0])]);
         let mount = Mount {
             height_m: Some(1.3),
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_above_the_horizon_or_of_unknown_size_is_left_out_with_its_index_and_reason() {
+    fn unplaceable_box_names_reason() {
         let boxes = report(vec![
             found("car", [600.0, 300.0, 660.0, 480.0]),
             found("gadget", [600.0, 20.0, 660.0, 60.0]),
@@ -295,7 +295,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_valid_boxes_make_a_report_that_every_receiver_accepts(
+        fn valid_boxes_make_acceptable_report(
             (heading_rad, pitch_rad, roll_rad) in (-6.0..6.0f64, -1.5..1.5f64, -3.0..3.0f64),
             height_m in option::of(0.01..1000.0f64),
             optics in [16.0..500_000.0f64, 16.0..300_000.0f64, 0.0..1280.0f64, 0.0..720.0f64],
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn distortion_of_the_lens_is_removed() {
+    fn lens_distortion_is_removed() {
         let ideal = report(vec![person(-1.5, 0.1)]);
         let mut bent = ideal.clone();
         let Intrinsics { fx, fy, cx, cy, .. } = intrinsics_of(&ideal.camera);

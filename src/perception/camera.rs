@@ -191,7 +191,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_image_edges_are_half_the_field_of_view_off_axis() {
+    fn edges_span_field_of_view() {
         let fov = 62.2f64.to_radians();
         let camera = Intrinsics::from_field_of_view(640, 480, fov, 48.8f64.to_radians());
         assert!((camera.bearing(0.0) - fov / 2.0).abs() < 1e-12);
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cameras_heading_is_accepted_by_receivers_whatever_the_vehicles_and_the_pan() {
+    fn camera_heading_stays_in_bounds() {
         let pan_rad = std::f64::consts::PI;
         let mount = Mount {
             pan_rad,
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pitched_camera_looks_down_and_a_rolled_one_leans_to_its_right() {
+    fn pitch_and_roll_turn_camera() {
         let axis = Vector3::z();
         let pitched = Mount {
             pitch_rad: 0.3,
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tilted_camera_sees_the_ground_from_a_near_edge_to_a_far_one_or_the_horizon() {
+    fn tilted_camera_has_near_ground_edge() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 40f64.to_radians());
         let view = |height_m, pitch_deg: f64| {
             Mount {
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_states_of_a_mount_what_is_known() {
+    fn only_stated_mount_is_reported() {
         let camera = Pose::new(1.0, 2.0, 0.5);
         let tilt = |pitch_rad, height_m| {
             let stated = Mount {

@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_moves_evenly_between_two_poses_and_goes_on_for_a_moment() {
+    fn pose_is_interpolated_and_briefly_extrapolated() {
         let history = history(&[(0, 0.0, 0.0), (100, 1.0, 0.2)]);
         for (at, x_m, heading_rad) in [
             (0, 0.0, 0.0),
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn where_no_pose_is_near_there_is_none() {
+    fn distant_times_have_no_pose() {
         assert_eq!(PoseHistory::default().at(ms(0)), None);
         let history = history(&[(1000, 0.0, 0.0), (4000, 9.0, 0.0), (4100, 9.5, 0.0)]);
         assert_eq!(history.at(ms(900)), None, "before all");
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_are_taken_in_order_and_memory_is_bounded() {
+    fn poses_are_ordered_and_bounded() {
         let mut history = history(&[(100, 0.0, 0.0)]);
         assert!(!history.push(ms(100), Pose::new(5.0, 0.0, 0.0)));
         assert!(!history.push(ms(50), Pose::new(5.0, 0.0, 0.0)));

@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_of_known_height_and_pitch_sees_places_on_the_ground_inside_its_rows() {
+    fn ground_positions_inside_rows_are_visible() {
         let intrinsics =
             Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
         let config = ViewConfig {
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn a_target_that_is_turned_away_hides_less() {
+    fn turned_target_hides_less() {
         let behind = landmark("behind", 0.40, 0.062, None);
         let before = landmark("before", 0.25, 0.0, Some(PI - 1.0));
         let hiding = PerceivedObject {
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn places_are_judged_by_the_sizes_that_are_listed() {
+    fn visibility_uses_listed_sizes() {
         let slot = landmark("slot", 8.0, 0.0, None);
         let car = ObjectSize::square(1.8);
         let sizes = ObjectSizes {
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_location_ahead_that_faces_the_camera_is_in_view() {
+    fn facing_landmark_ahead_is_visible() {
         assert!(sees(0.5, 0.0, Some(PI), &[]));
         assert!(
             sees(0.5, 0.0, Some(-PI), &[]),
@@ -362,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn the_whole_target_must_lie_inside_the_image() {
+    fn whole_target_must_be_visible() {
         let edge_m = 0.5 * 31.1f64.to_radians().tan();
         assert!(sees(0.5, edge_m - 0.04, Some(PI), &[]));
         assert!(
@@ -377,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn a_target_that_is_turned_away_or_too_small_is_not_in_view() {
+    fn turned_or_tiny_target_is_invisible() {
         assert!(sees(0.4, 0.0, Some(PI - 0.8), &[]));
         assert!(
             !sees(0.4, 0.0, Some(PI - 0.9), &[]),
@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_beyond_the_largest_range_is_in_view() {
+    fn range_limit_bounds_view() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
         let config = ViewConfig {
             max_range_m: 2.0,
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn a_nearer_object_hides_what_is_behind_it_but_not_its_own_place() {
+    fn nearer_object_hides_objects_behind() {
         assert!(!sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.0)]));
         assert!(
             !sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.045)]),
@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn a_listed_width_decides_how_much_an_object_hides() {
+    fn listed_width_sets_occlusion() {
         let sizes: ObjectSizes = serde_json::from_str(
             r#"{"labels": {"truck": {"width_m": 0.3, "height_m": 0.3},
             "QR": {"width_m": 0.05, "height_m": 0.05}}}"#,

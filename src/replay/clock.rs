@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dates_in_other_units_are_told_from_times_since_the_beginning() {
+    fn date_units_differ_from_relative_times() {
         for (first, unit) in [
             (1_732_154_400, Some(TimeUnit::Seconds)),
             (1_732_154_400_123, Some(TimeUnit::Milliseconds)),
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_clock_is_told_from_a_silence() {
+    fn wrong_clock_differs_from_silence() {
         let ahead = 9 * HOUR;
         for (times, wrong) in [
             (&[1, 2, ahead, 3, 4, 5][..], &[ahead][..]),

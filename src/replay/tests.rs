@@ -92,7 +92,7 @@ fn verdict_labels(output: &[FusedLine]) -> BTreeMap<String, Option<String>> {
 }
 
 #[test]
-fn an_open_cell_takes_its_locations_from_the_reports() {
+fn open_cell_learns_landmarks() {
     let both = [("slot-0", "car"), ("slot-1", "truck")];
     let mut lines = Vec::new();
     for step in 0..5 {
@@ -126,7 +126,7 @@ fn an_open_cell_takes_its_locations_from_the_reports() {
 }
 
 #[test]
-fn only_what_was_reported_to_speaks() {
+fn output_covers_reported_kind_only() {
     let lines: Vec<_> = (0..5)
         .map(|step| vote_line(&report("a", step * 100, &[("x", "cup")])))
         .collect();
@@ -140,7 +140,7 @@ fn only_what_was_reported_to_speaks() {
 }
 
 #[test]
-fn every_bad_line_has_its_reason_and_ends_nothing() {
+fn every_bad_line_has_reason() {
     use RejectReason::{Malformed, NodeMismatch, TooLarge, UnknownSchema, UnknownTopic};
     let good = report("a", 0, &[("x", "cup")]);
     let cbor = encode(&good, Encoding::Cbor);
@@ -203,7 +203,7 @@ fn nothing_in_is_nothing_out() {
 }
 
 #[test]
-fn whole_topics_and_times_of_receipt_are_understood() {
+fn full_topics_and_receipt_times_work() {
     let late = report("a", 0, &[("x", "cup")]);
     let topic = (
         "topic",
@@ -227,7 +227,7 @@ fn whole_topics_and_times_of_receipt_are_understood() {
 }
 
 #[test]
-fn time_does_not_go_back_and_a_wrong_clock_does_not_take_it_along() {
+fn wrong_clock_moves_no_time() {
     let hour = 3_600_000;
     let mut lines = Vec::new();
     for step in 0..20 {
@@ -259,7 +259,7 @@ fn time_does_not_go_back_and_a_wrong_clock_does_not_take_it_along() {
 }
 
 #[test]
-fn the_first_frame_has_a_map_at_its_time_with_all_its_reports() {
+fn first_frame_gives_complete_map() {
     for (start, period) in [(0, 100), (0, 20), (START, 100), (START, 500)] {
         let report = |node: &str, frame: u64, x: &str| {
             let at = Timestamp(start + frame * period * 1000);
@@ -285,7 +285,7 @@ fn the_first_frame_has_a_map_at_its_time_with_all_its_reports() {
 }
 
 #[test]
-fn a_long_silence_is_passed_over() {
+fn long_silence_is_skipped() {
     let day = 86_400_000;
     let lines = [0, 100, day, day + 100].map(|at| line(&report("a", at, &[("x", "car")]), &[]));
     let (output, summary) = replay(ReplayConfig::default(), &lines);
@@ -294,7 +294,7 @@ fn a_long_silence_is_passed_over() {
 }
 
 #[test]
-fn passes_go_over_all_votes_however_old() {
+fn passes_cover_all_votes() {
     let mut lines = Vec::new();
     for item in 0..30u64 {
         let place = format!("item-{item}");
@@ -335,7 +335,7 @@ fn passes_go_over_all_votes_however_old() {
 }
 
 #[test]
-fn with_passes_neither_time_nor_the_number_of_vehicles_keeps_a_vote_out() {
+fn passes_ignore_time_and_vehicle_limits() {
     let config = ReplayConfig {
         passes: Some(5),
         ..ReplayConfig::default()
@@ -367,7 +367,7 @@ fn with_passes_neither_time_nor_the_number_of_vehicles_keeps_a_vote_out() {
 }
 
 #[test]
-fn a_recording_without_times_gets_a_verdict_on_every_item() {
+fn timeless_recording_judges_every_item() {
     let items = (0..3000u64).map(|item| {
         vote_line(&report(
             &format!("v{item}"),
@@ -383,7 +383,7 @@ fn a_recording_without_times_gets_a_verdict_on_every_item() {
 }
 
 #[test]
-fn the_first_lines_of_a_kind_of_junk_are_told() {
+fn first_junk_lines_are_quoted() {
     let (_, summary) = replay(ReplayConfig::default(), ["", "junk", "{}", "[]", "more"]);
     let Rejections { lines, examples } = &summary.rejected[&RejectReason::Malformed];
     let said: Vec<_> = examples
@@ -502,7 +502,7 @@ fn live(
 }
 
 #[test]
-fn a_replay_is_what_a_live_aggregator_made_of_the_same_reports() {
+fn replay_matches_live_aggregator() {
     let (landmarks, reports) = drive();
     let config = ReplayConfig {
         landmarks,
@@ -528,7 +528,7 @@ fn a_replay_is_what_a_live_aggregator_made_of_the_same_reports() {
 }
 
 #[test]
-fn with_passes_the_last_answer_counts_once_and_whole() {
+fn passes_count_last_answer_once() {
     let config = ReplayConfig {
         passes: Some(10),
         ..ReplayConfig::default()
@@ -565,7 +565,7 @@ fn with_passes_the_last_answer_counts_once_and_whole() {
 }
 
 #[test]
-fn votes_by_name_need_no_position() {
+fn named_votes_need_no_position() {
     let pose = WirePose::from(Pose::new(500.0, 0.0, 1.0));
     let placeless = |topic: &str, key: &str| {
         let text = line(
@@ -615,7 +615,7 @@ fn votes_by_name_need_no_position() {
 }
 
 #[test]
-fn a_packet_that_the_end_cuts_short_is_judged_in_paper_mode() {
+fn paper_mode_judges_cut_packet() {
     let mut config = ReplayConfig::default();
     config.fusion.vote.mode = VoteMode::Paper;
     for frames in [3, 5, 7] {
@@ -650,7 +650,7 @@ fn a_packet_that_the_end_cuts_short_is_judged_in_paper_mode() {
 }
 
 #[test]
-fn neither_labels_nor_objects_of_one_report_are_too_many_for_a_recording() {
+fn recording_accepts_many_labels_and_objects() {
     let names: Vec<_> = (0..1500)
         .map(|n| (format!("item-{n}"), format!("label-{n}")))
         .collect();
@@ -675,7 +675,7 @@ fn neither_labels_nor_objects_of_one_report_are_too_many_for_a_recording() {
 }
 
 #[test]
-fn a_journal_with_a_change_of_settings_is_replayed_exactly_also_beyond_a_new_start() {
+fn settings_change_replays_exactly() {
     use crate::aggregator::{Aggregator, Command};
     use crate::reputation::ReputationLedger;
     let (_, reports) = drive();

@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn shares_carry_a_ledger_over_in_any_order_and_number() {
+    fn shares_transfer_ledger_unordered() {
         let mut ledger = ReputationLedger::default();
         for epoch in 1..=3 {
             (0..epoch).for_each(|n| ledger.record(epoch, &name("edge"), &vote(n > 0)));
@@ -413,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn what_another_lacks_makes_it_the_same_and_no_more() {
+    fn difference_equalises_ledgers() {
         let mut ledger = ReputationLedger::default();
         (0..200).for_each(|n| ledger.record(2, &name("edge"), &vote(n % 3 > 0)));
         let mut other = ledger.clone();
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_latest_lanes_are_kept() {
+    fn only_latest_lanes_are_kept() {
         let mut ledger = ReputationLedger::default();
         for epoch in 0..(2 * MAX_LANES as u64) {
             let lane = Epoch::new(epoch, name("edge"));
@@ -456,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn the_present_leaders_lane_has_room_whatever_others_claim() {
+    fn current_leaders_lane_is_protected() {
         let counted = Counts {
             correct: 1,
             incorrect: 0,
@@ -494,7 +494,7 @@ mod tests {
     }
 
     #[test]
-    fn names_used_up_in_one_lane_displace_older_lanes_and_nothing_else() {
+    fn full_lane_displaces_only_older_lanes() {
         let mut ledger = ReputationLedger::default();
         ledger.record(1, &name("edge"), &vote(true));
         ledger.record(2, &name("edge"), &vote(true));
@@ -524,7 +524,7 @@ mod tests {
 
     /// Its signed shares may invent any number of leaderships and vehicles.
     #[test]
-    fn a_false_leader_displaces_none_of_the_latest_half() {
+    fn false_leader_keeps_latest_half() {
         let counted = Counts {
             correct: 1,
             incorrect: 0,

@@ -35,7 +35,7 @@ proptest! {
     }
 
     #[test]
-    fn scores_stay_within_bounds_and_snapshots_come_back(a in ledger()) {
+    fn scores_are_bounded_and_snapshots_restore(a in ledger()) {
         for reputation in a.reputations(&ReputationConfig::default()).values() {
             prop_assert!((0.30..=1.00).contains(&reputation.score));
         }
@@ -45,7 +45,7 @@ proptest! {
 }
 
 #[test]
-fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
+fn new_evidence_displaces_old() {
     let name = |n: &str| NodeName::new(n).unwrap();
     let config = ReputationConfig::default();
     let vote = |correct| Evidence {
@@ -68,7 +68,7 @@ fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
 }
 
 #[test]
-fn partitions_that_counted_apart_merge_to_their_sum() {
+fn partition_counts_merge_to_sum() {
     let name = |n: &str| NodeName::new(n).unwrap();
     let evidence = Evidence {
         node: name("euclid"),
@@ -101,7 +101,7 @@ fn turncoat(wrong: u64) -> ReputationLedger {
 }
 
 #[test]
-fn who_was_right_for_long_and_turns_is_found_out_within_what_is_remembered() {
+fn long_correct_deceiver_is_detected() {
     let score = |wrong| {
         let reputations = turncoat(wrong).reputations(&ReputationConfig::default());
         let entry = reputations[&NodeName::from_static("turncoat")];
@@ -115,7 +115,7 @@ fn who_was_right_for_long_and_turns_is_found_out_within_what_is_remembered() {
 }
 
 #[test]
-fn a_ledger_of_a_million_votes_has_few_marks() {
+fn million_votes_have_few_marks() {
     let mut marks = marks::Marks::default();
     (1..=31_250).for_each(|number| {
         assert!(marks.insert(
@@ -130,7 +130,7 @@ fn a_ledger_of_a_million_votes_has_few_marks() {
 }
 
 #[test]
-fn marks_that_come_before_their_counts_or_are_lost_do_no_harm() {
+fn lost_marks_are_harmless() {
     let ledger = turncoat(700);
     let score = |ledger: &ReputationLedger| {
         ledger.reputations(&ReputationConfig::default())[&NodeName::from_static("turncoat")].score
@@ -147,7 +147,7 @@ fn marks_that_come_before_their_counts_or_are_lost_do_no_harm() {
 }
 
 #[test]
-fn a_snapshot_from_before_there_were_marks_is_read() {
+fn snapshot_without_marks_is_read() {
     let text = r#"{"lanes":{"3":{"edge":{"euclid":{"cup":{"correct":410,"incorrect":22}}}}}}"#;
     let ledger: ReputationLedger = serde_json::from_str(text).unwrap();
     assert_eq!(ledger.totals()[&NodeName::from_static("euclid")], (410, 22));
@@ -155,7 +155,7 @@ fn a_snapshot_from_before_there_were_marks_is_read() {
 }
 
 #[test]
-fn what_is_remembered_before_ones_own_votes_is_the_others() {
+fn remembered_votes_exclude_local_ones() {
     let ledger = turncoat(700);
     let remembered = |own| -> (f64, f64) {
         let votes = ledger.remembered(500.0, |_| own);

@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_coordinate_lies_in_the_cell_that_begins_at_or_below_it() {
+    fn coordinate_lies_above_cell_start() {
         let grid = TrackGrid::new(24.0);
         for coordinate_m in [
             -1e12,

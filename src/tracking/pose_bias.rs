@@ -333,7 +333,7 @@ mod tests {
     /// Twelve objects in five seconds of rounds, of which every time other 30 % are paired with a neighbour two to
     /// four metres away, always on the same side.
     #[test]
-    fn three_wrong_pairs_in_ten_do_not_mislead() {
+    fn few_wrong_pairs_are_tolerated() {
         let prior = BiasPrior {
             offset_m: 0.5,
             heading_rad: 0.01,
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_are_moved_only_by_a_delay_that_is_likelier_than_none() {
+    fn only_likely_delay_moves_stamps() {
         assert!((1..5).all(|seconds| delay_after(seconds, 0.0) == 0.0));
         let found = delay_after(10, 0.05);
         assert!((found - 0.05).abs() < 0.01, "{found} s");

@@ -94,7 +94,7 @@ fn near(object: &FusedObject, x_m: f64, y_m: f64, within_m: f64) -> bool {
 }
 
 #[test]
-fn what_several_vehicles_see_is_one_object_with_a_velocity() {
+fn common_object_has_one_velocity() {
     let round = two_cars(&mut tracker(), 0..30, |_| true);
     let cars = sure(&round);
     assert_eq!(cars.len(), 2, "{cars:?}");
@@ -112,7 +112,7 @@ fn what_several_vehicles_see_is_one_object_with_a_velocity() {
 }
 
 #[test]
-fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden() {
+fn object_fades_but_survives_occlusion() {
     let mut tracker = tracker();
     let before = two_cars(&mut tracker, 0..30, |_| true);
     let hidden = two_cars(&mut tracker, 30..38, |_| false);
@@ -135,7 +135,7 @@ fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden()
 }
 
 #[test]
-fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
+fn vehicle_is_not_its_obstacle() {
     let config = TracksConfig {
         vehicle_label: "van".into(),
         ..TracksConfig::default()
@@ -176,7 +176,7 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
 }
 
 #[test]
-fn a_fixed_camera_is_no_object() {
+fn fixed_camera_is_no_object() {
     let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
     let mut round = TracksRound::default();
     for frame in 0..20 {
@@ -203,7 +203,7 @@ fn a_fixed_camera_is_no_object() {
 }
 
 #[test]
-fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
+fn jumping_vehicle_stays_one_object() {
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();
     for frame in 0..40 {
@@ -231,7 +231,7 @@ fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
 }
 
 #[test]
-fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
+fn vacated_position_counts_no_misses() {
     let existence = |watchers: u32| {
         let mut tracker = tracker();
         let mut round = TracksRound::default();
@@ -272,7 +272,7 @@ fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
 
 /// A vehicle's first pose counts once: half of what a second one says.
 #[test]
-fn the_pose_that_spawns_a_track_is_not_counted_twice() {
+fn spawning_pose_counts_once() {
     let mut tracker = tracker();
     for frame in 0..2 {
         let pose = Some(WirePose::new(frame as f64, 0.0, 0.0));
@@ -299,7 +299,7 @@ fn the_pose_that_spawns_a_track_is_not_counted_twice() {
 }
 
 #[test]
-fn what_is_said_of_velocities_is_never_taken_for_better_than_one_of_them_says() {
+fn repeated_velocities_gain_no_accuracy() {
     let config = TracksConfig {
         manoeuvre_mps: 2.0,
         ..TracksConfig::default()
@@ -329,7 +329,7 @@ fn measurement() -> Measurement {
 }
 
 #[test]
-fn a_heading_about_due_east_is_not_averaged_to_west() {
+fn eastward_heading_averages_correctly() {
     let mut tracker = tracker();
     for frame in 0..30 {
         let heading_rad = Some(if frame % 2 == 0 { 359f64 } else { 1.0 }.to_radians());
@@ -345,7 +345,7 @@ fn a_heading_about_due_east_is_not_averaged_to_west() {
 }
 
 #[test]
-fn a_late_report_is_used_within_the_bound_and_counted_beyond() {
+fn late_report_counts_within_bound() {
     for frame_m in [1.5, 2.8] {
         a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m);
     }
@@ -386,7 +386,7 @@ fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
 }
 
 #[test]
-fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
+fn jumped_vehicle_looks_from_new_position() {
     let mut coverage = Coverage::default();
     let place = |x_m: f64| vec![car(x_m - 20.0, 0.0), car(x_m + 20.0, 0.0)];
     for frame in 0..10 {
@@ -403,7 +403,7 @@ fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
 }
 
 #[test]
-fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
+fn view_angle_is_limited_to_circle() {
     let sees = |angle_rad: f64, bearing_rad: f64| {
         let mut coverage = Coverage::default();
         let pose = Some(WirePose::new(10.0, -5.0, 2.0));
@@ -439,7 +439,7 @@ fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
 }
 
 #[test]
-fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
+fn jump_discards_pose_offset() {
     let mut tracker = tracker();
     let place = |x_m: f64| {
         (0..4)
@@ -486,7 +486,7 @@ fn misaligned(config: TracksConfig) -> TracksRound {
 }
 
 #[test]
-fn offsets_and_rotations_of_poses_are_found_and_published() {
+fn pose_offsets_and_rotations_are_published() {
     let round = misaligned(TracksConfig::default());
     assert_eq!(sure(&round).len(), 12);
     let [a, b] = ["euclid", "gauss"].map(|node| round.pose_corrections[&name(node)]);
@@ -503,7 +503,7 @@ fn offsets_and_rotations_of_poses_are_found_and_published() {
 }
 
 #[test]
-fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_takes_them_over() {
+fn equal_input_gives_equal_identities() {
     let mut leader = tracker();
     let mut standby = tracker();
     let mut newcomer = tracker();
@@ -547,7 +547,7 @@ fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_take
 }
 
 #[test]
-fn a_person_beside_a_car_is_not_the_car() {
+fn person_near_car_stays_separate() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..20 {
@@ -576,7 +576,7 @@ fn a_person_beside_a_car_is_not_the_car() {
 }
 
 #[test]
-fn a_detector_with_low_confidences_is_understood_after_a_while() {
+fn low_confidence_detector_is_calibrated() {
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let mut tracker = tracker();
     let mut round = TracksRound::default();
@@ -601,7 +601,7 @@ fn a_detector_with_low_confidences_is_understood_after_a_while() {
 }
 
 #[test]
-fn no_more_objects_than_an_area_can_hold_are_kept() {
+fn object_density_is_bounded() {
     let config = TracksConfig {
         max_density: 4,
         max_tracks: 20,
@@ -637,7 +637,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn whatever_is_reported_comes_to_numbers_that_can_be_computed_with(
+    fn any_report_gives_finite_numbers(
         rounds in vec(vec((0..4u64, 0..9u64, vec(object(), 0..12), prop::option::of((-50.0..50.0f64, -4.0..4.0f64))), 0..6), 1..8),
     ) {
         let mut tracker = tracker();
@@ -661,7 +661,7 @@ proptest! {
     }
 
     #[test]
-    fn the_order_in_which_the_reports_of_a_round_come_does_not_matter(
+    fn report_order_does_not_matter(
         rounds in vec(vec((0..4u64, vec(object(), 0..8)), 0..6), 1..6),
         seed in any::<u64>(),
     ) {

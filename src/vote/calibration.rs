@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_follow_what_a_band_is_worth() {
+    fn weights_follow_band_accuracy() {
         let calibration = learned((0..6000).map(|n| match n % 3 {
             0 => (0, 0.95, n % 20 != 0),
             1 => (0, 0.75, n % 4 != 0),
@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn confidence_that_says_nothing_weighs_nothing() {
+    fn uninformative_confidence_has_no_weight() {
         // Agreement and confidence repeat with periods that have no common factor.
         let calibration =
             learned((0..2000).map(|n| (0, f64::from(n % 19) / 19.0 + 0.02, n % 7 > 1)));
@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_that_rounding_leaves_behind_give_weights() {
+    fn rounding_residue_keeps_weights_finite() {
         let mut calibration = ConfidenceCalibration::new(10.0);
         calibration.count(3, 0.3, 1.0);
         calibration.count(3, 0.1 + 0.2, -1.0);
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn a_boastful_vehicle_weighs_no_more_than_a_modest_one() {
+    fn boastful_vehicle_gains_no_weight() {
         let calibration =
             learned((0..8000).map(|n| (n % 2, if n % 2 == 0 { 0.99 } else { 0.5 }, n % 5 != 0)));
         assert!((weight(&calibration, 0, 0.99) - weight(&calibration, 1, 0.5)).abs() < 0.05);

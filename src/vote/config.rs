@@ -157,7 +157,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn synonyms_are_written_as_they_are_read_and_only_labels_are_taken() {
+    fn synonyms_round_trip_and_need_labels() {
         let config: VoteConfig = toml::from_str("synonyms = { vase = \"sports ball\" }").unwrap();
         assert_eq!(config.synonyms["vase"], "sports ball");
         assert_eq!(config.validate(), Ok(()));

@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_forgotten_label_leaves_the_rest_as_if_it_had_never_been() {
+    fn forgotten_label_leaves_rest_unchanged() {
         let mut confusion = Confusion::default();
         let mut without = Confusion::default();
         for (truth, stated, weight) in [
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_fade_as_if_each_were_faded_however_long() {
+    fn bulk_fading_matches_single_fading() {
         let mut confusion = Confusion::default();
         let mut expected = 0.0;
         for step in 0..200_000u32 {

@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_that_all_make_alike_are_no_reason_for_matrices() {
+    fn common_errors_need_no_matrices() {
         let mut bias = LabelBias::new(MEMORY_VOTES);
         for landmark in 0..400u16 {
             let truth = landmark % 2;
@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn opposite_preferences_are_a_reason_for_matrices() {
+    fn opposite_preferences_need_matrices() {
         let mut bias = LabelBias::new(MEMORY_VOTES);
         for landmark in 0..400u16 {
             let truth = landmark % 2;
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn vehicles_that_fall_silent_leave_no_bias_behind() {
+    fn silent_vehicles_leave_no_bias() {
         let mut bias = LabelBias::new(MEMORY_VOTES);
         for landmark in 0..300u16 {
             let truth = landmark % 2;

@@ -27,14 +27,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_papers_visibility_is_the_printed_formula() {
+    fn paper_visibility_matches_formula() {
         let config = PaperConfig::default();
         let k = paper(&config, 1.27, -90f64.to_radians());
         assert!((k - (0.7 * 0.5 + 0.3 * 0.25)).abs() < 1e-12);
     }
 
     #[test]
-    fn visibility_falls_off_axis_and_with_distance() {
+    fn visibility_falls_with_angle_and_distance() {
         let config = WeightedConfig {
             max_range_m: 2.0,
             ..WeightedConfig::default()

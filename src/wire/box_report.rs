@@ -347,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_are_read_from_json_and_cbor() {
+    fn json_and_cbor_boxes_are_read() {
         let mut cbor = Vec::new();
         ciborium::into_writer(&valid(), &mut cbor).unwrap();
         let report = decoded(valid().to_string().as_bytes()).unwrap();
@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn each_flaw_is_refused_with_its_field_and_the_remedy() {
+    fn flaws_name_field_and_remedy() {
         let flaws = [
             ("/schema", json!(2), "schema: is 2, not 1"),
             ("/node", json!("gauss"), "node: is gauss, and the topic"),
@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_that_extends_a_little_beyond_the_image_is_accepted() {
+    fn box_slightly_beyond_image_is_accepted() {
         let mut report = valid();
         report["boxes"][0]["x_min"] = json!(-0.4);
         assert!(decoded(report.to_string().as_bytes()).is_ok());

@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn each_flaw_of_a_report_has_its_reason() {
+    fn report_flaws_have_reasons() {
         type Flaw = (fn(&mut ObjectReport), RejectReason);
         let flaws: [Flaw; 27] = [
             (|r| r.schema = 2, RejectReason::UnknownSchema),
@@ -370,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_read_in_the_forms_of_every_language() {
+    fn number_formats_of_languages_are_read() {
         let mut expected = report();
         expected.objects[0].x_m = 8.0;
         expected.objects[0].confidence = 1.0;
@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_occurs_twice_is_refused_whatever_the_form_of_numbers() {
+    fn duplicate_field_is_refused() {
         let text = String::from_utf8(encode(&report(), Encoding::Json)).unwrap();
         let twice = text.replacen("\"seq\":", "\"seq\":5.0,\"seq\":", 1);
         assert_ne!(twice, text);
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fault_of_a_number_names_its_field_in_json_and_cbor() {
+    fn number_fault_names_its_field() {
         let json: serde_json::Value =
             serde_json::from_slice(&encode(&report(), Encoding::Json)).unwrap();
         let mut half = json.clone();
@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn each_flaw_of_a_payload_has_its_reason() {
+    fn payload_flaws_have_reasons() {
         let json = String::from_utf8(encode(&report(), Encoding::Json)).unwrap();
         let mut not_utf8 = json.clone().into_bytes();
         not_utf8[json.find("ABCD").unwrap()] = 0xff;
@@ -495,7 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn a_compact_object_with_all_that_a_vote_needs_takes_at_most_40_bytes() {
+    fn compact_vote_object_fits_40_bytes() {
         let object = |x_m: f64, y_m: f64| PerceivedObject {
             covariance_m2: Some([0.0123, -0.0045, 0.0678]),
             landmark: Some("slot-31".into()),
@@ -518,14 +518,14 @@ mod tests {
     }
 
     #[test]
-    fn unknown_fields_are_ignored_and_optional_ones_may_be_null() {
+    fn unknown_fields_are_accepted() {
         let text = r#" {"schema":1,"node":"euclid","seq":1,"captured_at_us":5,"pose":null,"objects":[],"mood":[1e3]}"#;
         let report = decode_report(text.as_bytes(), &node(), &Limits::default()).unwrap();
         assert_eq!((report.pose, report.seen), (None, None));
     }
 
     #[test]
-    fn other_payloads_of_an_unknown_version_are_rejected_too() {
+    fn unknown_versions_are_rejected() {
         let text = br#"{"schema":2,"epoch":1,"round":1,"reputations":{}}"#;
         assert_eq!(
             decode::<Reputations>(text, &Limits::default()),
@@ -574,7 +574,7 @@ mod tests {
         }
 
         #[test]
-        fn compact_reports_are_as_close_as_promised_and_lose_no_more(report in reports()) {
+        fn compact_loss_stays_within_promise(report in reports()) {
             let bytes = encode(&report, Encoding::Compact);
             let decoded = decode_report(&bytes, &node(), &Limits::default()).unwrap();
             prop_assert_eq!((decoded.seq, decoded.captured_at_us, &decoded.seen), (report.seq, report.captured_at_us, &report.seen));

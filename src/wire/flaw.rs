@@ -187,7 +187,7 @@ mod tests {
     use crate::wire::{Encoding, PerceivedObject, encode};
 
     #[test]
-    fn the_field_is_named_in_every_encoding() {
+    fn every_encoding_names_field() {
         let object = |x_m| PerceivedObject::new("cup", 0.5, x_m, 2.0);
         let report = ObjectReport {
             objects: vec![object(1.0), object(f64::NAN)],

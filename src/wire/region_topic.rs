@@ -98,7 +98,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn topics_round_trip_and_strangers_are_none() {
+    fn topics_round_trip_and_others_fail() {
         let tile: Quadkey = "120220011012000".parse().unwrap();
         for kind in RegionTopicKind::ALL {
             let topic = RegionTopic {

@@ -134,7 +134,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn topics_round_trip_and_strangers_are_none() {
+    fn topics_round_trip_and_others_fail() {
         let topics = Topics::new(&NodeName::new("lot-1").expect("valid name"));
         let node = NodeName::new("euclid").expect("valid name");
         for topic in [

@@ -185,7 +185,7 @@ fn share(entries: Vec<LedgerEntry>, marks: Vec<LedgerMark>) -> LedgerShare {
 
 proptest! {
     #[test]
-    fn any_valid_votes_make_verdicts_that_every_receiver_accepts(
+    fn valid_votes_make_acceptable_verdicts(
         reports in vec(votes(), 1..8),
         mode in prop_oneof![Just(VoteMode::Weighted), Just(VoteMode::Paper)],
         is_open in any::<bool>(),
@@ -226,7 +226,7 @@ proptest! {
     }
 
     #[test]
-    fn any_valid_evidence_makes_reputations_and_shares_that_every_receiver_accepts(
+    fn valid_evidence_makes_acceptable_shares(
         entries in vec(entry(), 1..20),
         marks in vec(mark(), 0..10),
         votes in vec((name(), label(), any::<bool>()), 0..40),
@@ -250,7 +250,7 @@ proptest! {
     }
 
     #[test]
-    fn troubles_of_any_words_make_a_status_that_every_receiver_accepts(
+    fn any_trouble_makes_acceptable_status(
         words in prop_oneof![
             vec((words(64), words(400)), 1..80),
             vec((quotes(64), quotes(400)), 80),
@@ -284,7 +284,7 @@ proptest! {
     }
 
     #[test]
-    fn a_description_of_any_text_is_one_that_every_receiver_accepts(
+    fn any_text_makes_acceptable_description(
         text in "\\PC{0,400}|[\\x00-\\x1f\"\\\\]{0,400}",
         letter in prop_oneof![Just('a'), Just('\n'), Just('"'), Just('\u{1}')],
         is_long in any::<bool>(),

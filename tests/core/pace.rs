@@ -127,7 +127,7 @@ proptest! {
     }
 
     #[test]
-    fn no_label_comes_from_nowhere_and_vehicles_are_equal(
+    fn reported_labels_ignore_vehicle_order(
         objects in prop::collection::vec(prop::collection::vec(any_object(), 0..8), 1..5),
     ) {
         let landmarks: Vec<_> = (0..9).map(|i| landmark(i, f64::from(i as u32 % 3) * 2.0 - 2.0, f64::from(i as u32 / 3) * 2.0 - 2.0)).collect();
@@ -150,7 +150,7 @@ proptest! {
 }
 
 #[test]
-fn two_plates_cannot_share_a_spot() {
+fn two_plates_cannot_share_spot() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     pace.observe(
         &report(
@@ -167,7 +167,7 @@ fn two_plates_cannot_share_a_spot() {
 }
 
 #[test]
-fn a_row_of_cars_seen_from_a_wrong_pose_is_kept_in_order() {
+fn car_row_keeps_order_despite_pose() {
     let config = PaceConfig {
         gate_m: 1.0,
         ..PaceConfig::default()
@@ -198,7 +198,7 @@ fn a_row_of_cars_seen_from_a_wrong_pose_is_kept_in_order() {
 }
 
 #[test]
-fn a_detection_goes_to_one_landmark_only() {
+fn detection_matches_one_landmark() {
     let mut pace = pace(
         PaceConfig::default(),
         vec![landmark(0, 0.0, 0.0), landmark(1, 0.6, 0.0)],
@@ -211,7 +211,7 @@ fn a_detection_goes_to_one_landmark_only() {
 }
 
 #[test]
-fn empty_is_known_only_where_somebody_looked() {
+fn emptiness_needs_observer() {
     let mut pace = pace(
         PaceConfig::default(),
         vec![landmark(0, 0.0, 0.0), landmark(1, 5.0, 0.0)],
@@ -231,7 +231,7 @@ fn empty_is_known_only_where_somebody_looked() {
 }
 
 #[test]
-fn a_label_survives_misses_and_goes_when_the_object_has_gone() {
+fn label_survives_misses_until_departure() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     for n in 0..5 {
         pace.observe(
@@ -251,7 +251,7 @@ fn a_label_survives_misses_and_goes_when_the_object_has_gone() {
 }
 
 #[test]
-fn the_fresh_reading_of_one_outweighs_the_blindness_of_others() {
+fn fresh_reading_outweighs_misses() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     for n in 0..20 {
         for blind in ["b", "c", "d"] {
@@ -274,7 +274,7 @@ fn a_silent_vehicle_is_forgotten() {
 }
 
 #[test]
-fn precise_vehicles_move_the_position_more() {
+fn precise_vehicles_move_position_more() {
     let mut pace = pace(
         PaceConfig {
             position_floor_m: 0.01,
@@ -298,7 +298,7 @@ fn precise_vehicles_move_the_position_more() {
 }
 
 #[test]
-fn a_vacancy_sign_yields_to_the_car_before_it() {
+fn vacancy_sign_yields_to_car() {
     let spot = Landmark {
         vacancy: Some(VacancySign {
             label: "EMPTY".into(),
@@ -322,7 +322,7 @@ fn a_vacancy_sign_yields_to_the_car_before_it() {
 }
 
 #[test]
-fn a_place_that_was_looked_at_takes_the_vacancy_label_without_a_sign_in_view() {
+fn observed_empty_spot_gets_vacancy_label() {
     let spot = Landmark {
         vacancy: Some(VacancySign {
             label: "EMPTY".into(),
@@ -344,7 +344,7 @@ fn a_place_that_was_looked_at_takes_the_vacancy_label_without_a_sign_in_view() {
 }
 
 #[test]
-fn flicker_within_the_lead_does_not_change_the_label() {
+fn flicker_within_margin_keeps_label() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     pace.observe(
         &report("a", vec![object("car", 0.80, 0.0, 0.0)], &[]),
@@ -369,7 +369,7 @@ fn flicker_within_the_lead_does_not_change_the_label() {
 
 /// A car that one vehicle invents, where others look and find nothing; they list what they saw, or state their field of view.
 #[test]
-fn a_sole_claim_against_several_that_look_is_not_published() {
+fn contradicted_sole_claim_is_unpublished() {
     let facing = |node: &str, listed: bool| {
         let seen = listed.then(|| vec!["slot-0".into()]);
         let pose = Some(WirePose::new(-5.0, 0.0, 0.0));

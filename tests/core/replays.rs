@@ -56,12 +56,12 @@ fn check(config: ReplayConfig, expected: &str) {
 }
 
 #[test]
-fn a_known_cell_is_replayed_to_the_byte() {
+fn closed_cell_replays_to_byte() {
     check(lot(), "894d6a04-1c9c-56be-b53d-e205bb7ad342");
 }
 
 #[test]
-fn a_cell_that_learns_its_locations_is_replayed_to_the_byte() {
+fn learning_cell_replays_to_byte() {
     check(
         ReplayConfig::default(),
         "40920db4-e22d-5107-ba9d-d4df6ef41630",
@@ -69,7 +69,7 @@ fn a_cell_that_learns_its_locations_is_replayed_to_the_byte() {
 }
 
 #[test]
-fn passes_over_all_votes_are_replayed_to_the_byte() {
+fn passes_replay_to_byte() {
     check(
         ReplayConfig {
             passes: Some(20),

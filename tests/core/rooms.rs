@@ -22,7 +22,7 @@ const CRATES: [(&str, &str); 6] = [
 ];
 
 #[test]
-fn imports_run_downward_without_a_circle() {
+fn imports_have_no_cycle() {
     let house = House::read(Path::new(env!("CARGO_MANIFEST_DIR")));
     assert!(house.imports.len() > 100, "the sources were read");
     let mut circles = Vec::new();
@@ -49,7 +49,7 @@ fn imports_run_downward_without_a_circle() {
 const IDIOMS: [&str; 6] = ["Arguments", "Cli", "Command", "Error", "Msg", "State"];
 
 #[test]
-fn one_type_name_means_one_thing() {
+fn type_names_are_unique() {
     let house = House::read(Path::new(env!("CARGO_MANIFEST_DIR")));
     let mut named = BTreeMap::<String, BTreeSet<&Module>>::new();
     for (module, path) in &house.modules {
@@ -79,7 +79,7 @@ fn one_type_name_means_one_thing() {
 }
 
 #[test]
-fn a_circle_is_found_and_named() {
+fn cycle_is_found_and_named() {
     let graph = |edges: &[(&str, &str)]| {
         let mut graph = BTreeMap::<String, BTreeSet<String>>::new();
         for (from, to) in edges {

@@ -51,7 +51,7 @@ fn replayed(lines: &[ObjectReport]) -> (Vec<GlobalMap>, Summary) {
 
 /// One map for every frame, at its time, with the cars where they are, whatever the phase of the rounds.
 #[test]
-fn a_recording_without_landmarks_is_tracked_frame_by_frame() {
+fn recording_without_landmarks_is_tracked() {
     for jitter_us in [0, 300, 4_000] {
         let time =
             |frame: u64| Timestamp(START + frame * 100_000 + (frame * 7_919) % (2 * jitter_us + 1));
@@ -86,7 +86,7 @@ fn a_recording_without_landmarks_is_tracked_frame_by_frame() {
 }
 
 #[test]
-fn a_vehicle_that_misses_frames_does_not_shift_the_others_maps() {
+fn missed_frames_shift_no_other_maps() {
     let time = |frame: u64| Timestamp(START + frame * 100_000);
     let lines: Vec<_> = (0..60)
         .flat_map(|frame| ["euclid", "gauss"].map(|node| (frame, node)))
@@ -117,7 +117,7 @@ fn landmark() -> Landmark {
 }
 
 #[test]
-fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
+fn landmarks_leave_rest_to_optional_tracks() {
     for (mode, expected) in [
         (TracksMode::Auto, 0),
         (TracksMode::Off, 0),
@@ -152,7 +152,7 @@ fn beside_known_locations_only_the_rest_is_tracked_and_only_if_asked_for() {
 }
 
 #[test]
-fn a_standby_leads_on_with_the_same_identities() {
+fn standby_keeps_identities() {
     let open = || Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(START));
     let mut leader = open();
     let mut standby = open();
@@ -199,7 +199,7 @@ fn a_standby_leads_on_with_the_same_identities() {
 /// Detections of `euclid` in frames that were overtaken by the next are in the map too, once each; one that comes later than
 /// the bound is not, and is counted.
 #[test]
-fn overtaken_reports_count_for_tracks_within_the_bound_and_not_for_known_locations() {
+fn overtaken_reports_count_for_tracks_only() {
     let tracks = TracksConfig {
         mode: TracksMode::On,
         ..TracksConfig::default()
@@ -323,7 +323,7 @@ fn dragged_by(shift_m: f64, stated_sigma_m: f64, has_pose: bool) -> f64 {
 
 /// Its shift is estimated as its pose error, against the majority of the others.
 #[test]
-fn a_vehicle_that_states_shifted_places_precisely_hardly_moves_the_map() {
+fn precise_shifted_vehicle_hardly_moves_map() {
     for has_pose in [false, true] {
         let honest_m = dragged_by(0.0, 0.3, has_pose);
         let dragged_m = [0.5, 1.0, 1.5].map(|shift_m| dragged_by(shift_m, 0.01, has_pose));
@@ -337,7 +337,7 @@ fn a_vehicle_that_states_shifted_places_precisely_hardly_moves_the_map() {
 /// Share of the maps in which a car that one vehicle invents is more probable than not, while four that have its place in
 /// view report nothing there: at a known location, and elsewhere.
 #[test]
-fn what_one_invents_is_no_fact_where_four_look() {
+fn contradicted_invention_is_no_fact() {
     let place = Landmark {
         id: "slot-0".into(),
         position: Point2::new(20.0, 0.0),

@@ -35,7 +35,7 @@ fn report(node: &str, seq: u64, at: Timestamp, votes: &[(&str, &str, f64)]) -> O
 }
 
 #[test]
-fn a_report_that_comes_twice_is_rejected_and_changes_nothing() {
+fn repeated_report_is_rejected() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let first = report("a", 1, START, &[("x", "cup", 0.9)]);
     vote.observe(&first, START).unwrap();
@@ -44,7 +44,7 @@ fn a_report_that_comes_twice_is_rejected_and_changes_nothing() {
 }
 
 #[test]
-fn a_vehicle_that_does_not_count_its_reports_is_heard_by_their_times() {
+fn uncounted_reports_order_by_time() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for (ms, label) in [(0, "cup"), (100, "mouse")] {
         let at = START + Duration::from_millis(ms);
@@ -55,7 +55,7 @@ fn a_vehicle_that_does_not_count_its_reports_is_heard_by_their_times() {
 }
 
 #[test]
-fn a_vehicle_has_one_vote_however_often_it_publishes() {
+fn vehicle_has_one_vote() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for n in 0..10 {
         let at = START + Duration::from_millis(n);
@@ -75,7 +75,7 @@ fn a_vehicle_has_one_vote_however_often_it_publishes() {
 }
 
 #[test]
-fn silence_and_votes_without_weight_leave_no_verdict() {
+fn weightless_votes_give_no_verdict() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     assert!(vote.close(START).verdicts.is_empty());
     vote.observe(&report("a", 1, START, &[("x", "cup", 0.0)]), START)
@@ -88,7 +88,7 @@ fn silence_and_votes_without_weight_leave_no_verdict() {
 }
 
 #[test]
-fn a_verdict_ends_when_its_votes_are_stale() {
+fn verdict_ends_with_stale_votes() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     vote.observe(&report("a", 1, START, &[("x", "cup", 0.9)]), START)
         .unwrap();
@@ -105,7 +105,7 @@ fn a_verdict_ends_when_its_votes_are_stale() {
 }
 
 #[test]
-fn paper_mode_sums_the_printed_products_and_never_clears() {
+fn paper_mode_sums_printed_products() {
     let mut vote = Vote::new(
         VoteConfig {
             mode: VoteMode::Paper,
@@ -149,7 +149,7 @@ fn name(node: &str) -> NodeName {
 }
 
 #[test]
-fn a_closed_cell_has_a_verdict_for_every_landmark_and_ignores_others() {
+fn closed_cell_judges_only_landmarks() {
     let mut vote = Vote::new(
         VoteConfig::default(),
         vec![landmark("x", &[]), landmark("y", &[])],
@@ -180,7 +180,7 @@ fn a_closed_cell_has_a_verdict_for_every_landmark_and_ignores_others() {
 }
 
 #[test]
-fn a_cell_without_reports_closes_round_after_round() {
+fn cell_without_reports_closes_rounds() {
     let mut vote = Vote::new(VoteConfig::default(), vec![landmark("x", &[])]);
     for second in 0..5 {
         let round = vote.close(START + Duration::from_secs(second));
@@ -197,7 +197,7 @@ fn a_cell_without_reports_closes_round_after_round() {
 }
 
 #[test]
-fn an_older_report_that_comes_later_is_rejected() {
+fn older_later_report_is_rejected() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let later = START + Duration::from_millis(100);
     vote.observe(&report("a", 2, later, &[("x", "cup", 0.9)]), later)
@@ -208,7 +208,7 @@ fn an_older_report_that_comes_later_is_rejected() {
 }
 
 #[test]
-fn a_negative_confidence_is_rejected_with_its_report() {
+fn negative_confidence_rejects_report() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     assert!(
         vote.observe(&report("a", 1, START, &[("x", "cup", -0.5)]), START)
@@ -218,7 +218,7 @@ fn a_negative_confidence_is_rejected_with_its_report() {
 }
 
 #[test]
-fn two_labels_of_one_vehicle_at_a_landmark_are_one_vote_for_the_surer() {
+fn surer_of_two_labels_counts() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     vote.observe(
         &report("a", 1, START, &[("x", "cup", 0.4), ("x", "mouse", 0.8)]),
@@ -250,7 +250,7 @@ fn synonyms_count_as_one_label() {
 }
 
 #[test]
-fn a_shown_label_is_held_until_another_leads_clearly() {
+fn label_holds_until_clear_lead() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let shown = |vote: &mut Vote, seq: u64, votes: &[(&str, &str)]| {
         let at = START + Duration::from_millis(seq);
@@ -267,7 +267,7 @@ fn a_shown_label_is_held_until_another_leads_clearly() {
 }
 
 #[test]
-fn vehicles_and_landmarks_beyond_their_limits_change_nothing_else() {
+fn excess_vehicles_are_ignored() {
     let config = VoteConfig {
         max_vehicles: 2,
         max_landmarks: 2,
@@ -295,7 +295,7 @@ fn vehicles_and_landmarks_beyond_their_limits_change_nothing_else() {
 }
 
 #[test]
-fn an_adopted_ledger_restores_trust_by_class() {
+fn adopted_ledger_restores_class_trust() {
     let mut ledger = ReputationLedger::default();
     for n in 0..200 {
         for (node, label, correct) in [
@@ -357,7 +357,7 @@ fn an_adopted_ledger_restores_trust_by_class() {
 }
 
 #[test]
-fn a_crowd_of_newcomers_does_not_outvote_a_proven_vehicle_pair() {
+fn newcomers_cannot_outvote_proven_pair() {
     let mut ledger = ReputationLedger::default();
     for _ in 0..100 {
         for node in ["a", "b"] {
@@ -389,7 +389,7 @@ fn a_crowd_of_newcomers_does_not_outvote_a_proven_vehicle_pair() {
 }
 
 #[test]
-fn a_vote_without_a_witness_earns_no_reputation() {
+fn unwitnessed_vote_earns_no_reputation() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut evidence = 0;
     for n in 0..100 {
@@ -402,7 +402,7 @@ fn a_vote_without_a_witness_earns_no_reputation() {
 }
 
 #[test]
-fn two_against_one_stay_right_when_votes_become_evidence_whoever_reports_first() {
+fn majority_holds_in_any_order() {
     for order in [
         [0, 1, 2],
         [0, 2, 1],
@@ -440,7 +440,7 @@ fn two_against_one_stay_right_when_votes_become_evidence_whoever_reports_first()
 /// One vehicle reports the truth while it is alone, and another label everywhere as soon as others come, one every ten
 /// seconds. All places, or nearly all, have one label, so that agreement beyond chance tells nothing.
 #[test]
-fn who_was_there_first_does_not_outvote_several_that_come_later() {
+fn later_majority_outvotes_first() {
     for rare in [0, 1, 3] {
         let truth = |place: usize| if place < rare { "van" } else { "car" };
         let names: Vec<String> = (0..12).map(|place| format!("slot-{place}")).collect();
@@ -480,7 +480,7 @@ fn who_was_there_first_does_not_outvote_several_that_come_later() {
 
 /// Two vehicles that are always right agree as closely as copies do.
 #[test]
-fn two_that_are_always_right_outvote_a_third_that_is_mostly_wrong() {
+fn two_right_outvote_wrong_third() {
     let weighted = WeightedConfig {
         freshness_s: 1e9,
         ..WeightedConfig::default()
@@ -522,7 +522,7 @@ fn two_that_are_always_right_outvote_a_third_that_is_mostly_wrong() {
 }
 
 #[test]
-fn four_of_nine_that_copy_one_wrong_label_are_found_out() {
+fn four_copying_vehicles_are_detected() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let labels = ["car", "cup", "mouse", "sports ball", "vase"];
     let mut state = 1u64;
@@ -570,7 +570,7 @@ fn four_of_nine_that_copy_one_wrong_label_are_found_out() {
 }
 
 #[test]
-fn names_used_up_do_not_lock_newcomers_out() {
+fn exhausted_names_block_no_newcomers() {
     let mut vote = Vote::new(
         VoteConfig {
             max_vehicles: 8,
@@ -615,7 +615,7 @@ fn names_used_up_do_not_lock_newcomers_out() {
 }
 
 #[test]
-fn a_number_that_a_forgotten_vehicle_leaves_carries_nothing_of_it() {
+fn reused_vehicle_index_starts_empty() {
     let config = VoteConfig {
         max_vehicles: 3,
         ..VoteConfig::default()
@@ -645,7 +645,7 @@ fn a_number_that_a_forgotten_vehicle_leaves_carries_nothing_of_it() {
 }
 
 #[test]
-fn a_vehicle_whose_clock_is_set_back_goes_on_voting() {
+fn backward_clock_keeps_voting() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let at = |s: u64| START + Duration::from_secs(s);
     vote.observe(&report("a", 7, at(3600), &[("x", "cup", 0.9)]), at(0))
@@ -676,7 +676,7 @@ fn a_vehicle_whose_clock_is_set_back_goes_on_voting() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
-    fn refined_labels_were_voted_for_and_do_not_depend_on_order(
+    fn refined_labels_ignore_vote_order(
         votes in proptest::collection::btree_map((0usize..6, 0usize..5), 0usize..3, 1..30),
         seed in any::<u64>(),
     ) {

@@ -598,7 +598,7 @@ fn three_nodes_in_every_order() {
 }
 
 #[test]
-fn four_nodes_in_long_random_orders() {
+fn four_nodes_in_random_orders() {
     let model = CellModel {
         initial: settled(4),
         depth: 120,

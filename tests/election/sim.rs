@@ -27,7 +27,7 @@ const SECOND: u64 = 1000 * MS;
 
 /// Faults of every kind strike a cell; all end; then one leader, of the best rank, is left and stays.
 #[test]
-fn a_cell_left_alone_has_the_best_leader() {
+fn undisturbed_cell_has_best_leader() {
     for_seeds(seeds(), |seed| {
         let mut world = cell(seed);
         let nodes = world.nodes.len();
@@ -60,13 +60,13 @@ fn are_bounded(what: &str, most_us: u64, gap_of: impl Fn(u64) -> Option<u64>) {
 
 /// A leader whose process is killed is replaced within 200 ms, seen by the worst vehicle.
 #[test]
-fn a_killed_leader_is_replaced_in_200_ms() {
+fn killed_leader_replaced_in_200_ms() {
     are_bounded("killed", 200 * MS, |seed| failover_gap(seed, true, 1));
 }
 
 /// A leader killed together with its standby is replaced within 200 ms too.
 #[test]
-fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
+fn killed_leader_and_standby_replaced() {
     are_bounded("killed with its standby", 200 * MS, |seed| {
         failover_gap(seed, true, 2)
     });
@@ -74,20 +74,20 @@ fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
 
 /// A leader that falls silent is replaced within 400 ms, seen by the worst vehicle.
 #[test]
-fn a_silent_leader_is_replaced_in_400_ms() {
+fn silent_leader_replaced_in_400_ms() {
     are_bounded("silent", 400 * MS, |seed| failover_gap(seed, false, 1));
 }
 
 /// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is;
 /// and the sides become one without a quarrel.
 #[test]
-fn a_side_without_the_leader_has_its_own_in_400_ms() {
+fn leaderless_side_recovers_in_400_ms() {
     are_bounded("split", 400 * MS, split_gap);
 }
 
 /// An edge that returns is handed the lead, and no vehicle misses a round or takes one twice; 5 % of packets are lost.
 #[test]
-fn handing_back_misses_and_repeats_no_round() {
+fn handback_misses_no_round() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         world.nodes[0].config.role = Role::Edge;
@@ -140,7 +140,7 @@ fn handing_back_misses_and_repeats_no_round() {
 /// A leader that is cut off leads on alone while others follow another. When it is back its maps do not go back in epoch, also
 /// when the election's messages come later than the other's maps.
 #[test]
-fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
+fn cut_off_leader_keeps_epoch_order() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         start_all(&mut world);
@@ -177,7 +177,7 @@ fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
 
 /// One link that works one way only, for good, moves the lead at most twice.
 #[test]
-fn a_one_way_link_does_not_flap() {
+fn one_way_link_does_not_flap() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         let nodes = world.nodes.len();
@@ -207,13 +207,13 @@ fn a_one_way_link_does_not_flap() {
 
 /// Timers up to 60 ms late on every node are no reason to change the leader.
 #[test]
-fn a_busy_machine_keeps_its_leader() {
+fn busy_machine_keeps_leader() {
     keeps_its_leader(60 * MS, 0);
 }
 
 /// One lost packet in five is no reason to change the leader.
 #[test]
-fn a_poor_network_keeps_its_leader() {
+fn poor_network_keeps_leader() {
     keeps_its_leader(2 * MS, 20);
 }
 
@@ -272,7 +272,7 @@ fn a_leader_without_broker_abdicates() {
 
 /// A leader whose fuser or gateway hangs gives the lead away in seconds, and gets it back when it is whole and the better one.
 #[test]
-fn a_leader_with_a_broken_part_makes_way() {
+fn leader_with_broken_part_yields() {
     for_seeds(seeds() / 10, |seed| {
         for fault in [
             |node, works| Fault::Fuser { node, works },
@@ -304,13 +304,13 @@ fn a_leader_with_a_broken_part_makes_way() {
 
 /// Evidence about vehicles is counted once, and what any candidate knows when the faults end all know soon.
 #[test]
-fn no_evidence_is_lost_or_counted_twice() {
+fn evidence_is_counted_exactly_once() {
     evidence_survives(false);
 }
 
 /// The same in cells with certificates, of what a candidate passes on: leaderships of some seconds may be forgotten.
 #[test]
-fn no_signed_evidence_is_lost_or_counted_twice() {
+fn signed_evidence_is_counted_once() {
     evidence_survives(true);
 }
 
@@ -357,7 +357,7 @@ fn evidence_survives(signed: bool) {
 
 /// Whoever is named standby and leaves, or is killed, is not named for long, and no message goes to it for ever.
 #[test]
-fn a_standby_that_is_gone_is_not_named() {
+fn departed_standby_is_not_named() {
     for_seeds(seeds() / 10, |seed| {
         // Of an unseen one, from when the leader's membership has found out, and says so within 300 ms.
         for (fault, is_unseen, patience) in [

@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
+    async fn dead_broker_ends_its_actor() {
         let (actor, ended) =
             Actor::spawn(None, Broker, Box::new(DeadBroker) as Box<dyn MqttBroker>)
                 .await

@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_detector_whose_reports_come_too_late_is_slow_by_its_measured_time() {
+    async fn late_reports_mark_detector_slow() {
         let counters = Arc::<Counters>::default();
         let frame_ms = Arc::new(AtomicU64::new(300));
         let detector = arguments(Steady(Arc::clone(&frame_ms)), &counters);
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_detector_that_does_not_finish_a_frame_is_a_trouble_until_it_does() {
+    async fn unfinished_frame_is_trouble() {
         let (done, waits) = channel();
         let counters = Arc::<Counters>::default();
         let detector = arguments(Slow(waits), &counters);

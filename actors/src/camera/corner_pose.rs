@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_projected_target_is_found_where_it_was_whatever_its_yaw() {
+    fn target_is_placed_at_any_yaw() {
         for yaw_deg in [-60.0, -30.0, 0.0, 15.0, 45.0] {
             for middle in [
                 Point3::new(0.0, 0.0, 0.5),
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_pixel_of_noise_costs_little_range() {
+    fn half_pixel_noise_is_tolerated() {
         let middle = Point3::new(0.05, 0.0, 0.4);
         let mut seen = corners(middle, 0.05, 0.4, 0.0);
         seen[0].x += 0.5;
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_that_mirror_each_other_have_a_position() {
+    fn mirrored_corners_give_position() {
         for square in [
             [
                 (154.0, 210.0),
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_without_a_square_have_no_position() {
+    fn corners_need_square() {
         let at = Point2::new(300.0, 200.0);
         assert!(
             locate_target(&[at; 4], 0.05, &camera()).is_err(),

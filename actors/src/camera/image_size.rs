@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_of_the_same_shape_is_scaled() {
+    fn frame_of_equal_shape_is_scaled() {
         let mut detections = seen();
         OPTICS
             .fit(
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_of_another_shape_is_an_error_that_names_both_sizes() {
+    fn other_shape_names_both_sizes() {
         for (width, height) in [(1280, 720), (480, 640), (640, 0)] {
             let mut detections = seen();
             let error = OPTICS

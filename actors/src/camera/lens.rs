@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn corners_return_to_where_an_ideal_lens_draws_them() {
+    fn corners_match_ideal_lens() {
         let ideal = [
             (500.0, 100.0),
             (560.0, 105.0),
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_of_view_alone_holds_for_frames_of_any_shape() {
+    fn field_of_view_fits_any_shape() {
         let horizontal_rad = 70f64.to_radians();
         let narrow = Lens::ideal(Intrinsics::with_square_pixels(640, 480, horizontal_rad));
         let wide = ImageSize {

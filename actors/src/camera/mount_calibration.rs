@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_vehicle_is_where_its_camera_says() {
+    fn vehicle_position_follows_camera() {
         let mount = Mount {
             forward_m: -2.0,
             left_m: 0.7,

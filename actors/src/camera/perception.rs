@@ -304,7 +304,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_object_that_nobody_would_take_does_not_cost_the_others() {
+    fn unwanted_object_leaves_others_reported() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
         let vehicle_camera = VehicleCamera {
             node: NodeName::from_static("euclid"),
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_without_a_size_are_counted_by_name_for_as_long_as_they_are_seen() {
+    fn labels_without_size_are_counted() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
         let vehicle_camera = VehicleCamera {
             node: NodeName::from_static("cam"),

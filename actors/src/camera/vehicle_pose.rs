@@ -240,7 +240,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pose_has_its_own_time_or_that_of_its_receipt() {
+    fn pose_time_defaults_to_receipt() {
         let now = Timestamp(7);
         let told = read_pose(
             br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#,
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_on_earth_is_told_in_degrees() {
+    fn earth_pose_is_in_degrees() {
         let told = read_pose(
             br#"{"latitude_deg":52.2,"longitude_deg":21,"azimuth_deg":270,"captured_at_us":5}"#,
             Timestamp(7),
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_in_metres_may_have_the_heading_of_a_compass() {
+    fn metric_pose_accepts_compass_heading() {
         let south = StatedPose::ByCompass(Point2::new(1.0, 6.0), 180.0);
         let told = read_pose(br#"{"x_m":1,"y_m":6,"azimuth_deg":180}"#, Timestamp(7), 0);
         assert_eq!(told, Ok((Timestamp(7), south)));
@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_pose_is_refused_with_a_reason() {
+    fn invalid_pose_names_reason() {
         for (datagram, reason) in [
             (&b"{\"x_m\":1,\"y_m\":2}"[..], "heading_rad"),
             (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "`x_m`: 1e12"),
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configured_pose_is_all_in_the_frame_or_all_on_earth() {
+    fn configured_pose_uses_one_frame() {
         let pose = |toml: &str| {
             let pose: PoseConfig = toml::from_str(toml).unwrap();
             pose.validate()
@@ -375,7 +375,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stamp_ahead_of_the_clock_is_refused_by_itself() {
+    fn future_stamp_is_refused() {
         let now = Timestamp(1_732_154_400_000_000);
         let read = |stamp: String| {
             let text = format!(r#"{{"x_m":1,"y_m":2,"heading_rad":0,"captured_at_us":{stamp}}}"#);

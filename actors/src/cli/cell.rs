@@ -489,7 +489,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_difference_is_a_value_and_neither_order_nor_spelling() {
+    fn order_and_spelling_are_ignored() {
         let cell = "[fusion.pace]\ngate_m = 1\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"b\"\nx_m = 1\ny_m = 0";
         let same = "# ours\n[[landmarks]]\nid = \"b\"\nx_m = 1.0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[fusion.pace]\ngate_m = 1.0\ngate_sigmas = 4.0";
         let other = "[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 2\n[[landmarks]]\nid = \"c\"\nx_m = 0\ny_m = 0";

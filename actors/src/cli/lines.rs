@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_by_another_name_is_not_written_while_it_is_read() {
+    fn input_alias_is_not_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         let [read, linked, hard] = ["read", "linked", "hard"].map(|name| folder.path().join(name));
         fs::write(&read, "\u{feff}first\n").unwrap();
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_bounded_and_the_rest_of_a_large_one_is_passed_over() {
+    fn overlong_line_is_skipped() {
         let mut source = BufReader::with_capacity(3, &b"12345\n123456\n\n12345678901\nlast"[..]);
         let mut line = Vec::new();
         let mut next = || {

@@ -213,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_counters_of_a_health_line_are_objects_in_json() {
+    fn health_counters_are_json_objects() {
         let mut output = tempfile::tempfile().unwrap();
         let written = Arc::new(output.try_clone().unwrap());
         let subscriber = tracing_subscriber::registry().with(json_to(written));

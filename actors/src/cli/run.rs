@@ -320,14 +320,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_table_of_flags_that_were_not_given_hides_nothing_in_the_file() {
+    fn unset_flags_keep_file_values() {
         let mut keys = json!({ "name": null, "mqtt": { "broker": "edge:1883" }, "dashboard": { "listen": null } });
         remove_nulls(&mut keys);
         assert_eq!(keys, json!({ "mqtt": { "broker": "edge:1883" } }));
     }
 
     #[test]
-    fn an_observer_leaves_the_addresses_in_the_file_to_the_node_they_are_for() {
+    fn observer_ignores_node_addresses() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("node.toml");
         let text = "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";

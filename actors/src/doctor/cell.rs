@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_that_runs_on_another_machine_is_named_with_its_address() {
+    fn name_running_elsewhere_is_named() {
         let own = UdpSocket::bind("127.0.0.1:0").unwrap();
         let config = NodeConfig {
             name: Some(NodeName::from_static("euclid")),

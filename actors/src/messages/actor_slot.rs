@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_actor_that_was_stopped_with_the_node_is_still_waited_for() {
+    async fn stopped_actor_is_awaited() {
         let slot = ActorSlot::default();
         let (actor, _) = Actor::spawn(None, Held, ()).await.unwrap();
         slot.set(actor);

@@ -496,7 +496,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_override_the_file_and_the_file_the_defaults() {
+    fn precedence_is_flags_file_defaults() {
         let config = load("name = \"from-file\"\nrole = \"edge\"\ncell = \"lot-9\"").unwrap();
         assert_eq!(config.name.as_ref().unwrap().as_str(), "from-flag");
         assert_eq!(config.cell.as_str(), "lot-9");
@@ -511,7 +511,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_name_the_key_the_value_and_what_is_allowed() {
+    fn errors_name_key_value_range() {
         for (toml, parts) in [
             (
                 "role = \"edge\"\n[fusion.pace]\ngate_m = -1",
@@ -568,7 +568,7 @@ mod tests {
 
     #[cfg(feature = "camera")]
     #[test]
-    fn errors_name_the_key_of_a_table_that_has_a_kind() {
+    fn tagged_table_errors_name_key() {
         let source = "[camera.detector]\nkind = \"placard\"\n[camera.source]\n";
         for (toml, parts) in [
             (
@@ -602,7 +602,7 @@ mod tests {
     }
 
     #[test]
-    fn a_configuration_that_is_cut_off_or_empty_stops_the_start() {
+    fn incomplete_configuration_stops_start() {
         let written =
             format!("# Whole with `{END_OF_CONFIGURATION}`.\nname = \"n\"\n[tls]\nca = \"a\"\n");
         let cut = load(&written).unwrap_err().to_string();
@@ -631,13 +631,13 @@ mod tests {
     }
 
     #[test]
-    fn a_printed_configuration_can_be_read_back() {
+    fn printed_configuration_can_be_read() {
         let config = load("role = \"edge\"").unwrap();
         assert_eq!(load(&config.to_toml().unwrap()).unwrap(), config);
     }
 
     #[test]
-    fn a_printed_configuration_says_that_the_password_is_missing_and_has_no_other_in_its_place() {
+    fn printed_configuration_omits_password() {
         let config = load("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"hush\"").unwrap();
         let printed = config.to_toml().unwrap();
         assert!(
@@ -652,7 +652,7 @@ mod tests {
     }
 
     #[test]
-    fn no_error_shows_a_cell_key() {
+    fn errors_hide_cell_key() {
         for key in ["4711471147114711", "\"4711471147114711"] {
             let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}"))
                 .unwrap_err()
@@ -662,7 +662,7 @@ mod tests {
     }
 
     #[test]
-    fn no_error_shows_a_token_or_the_login_of_a_camera() {
+    fn errors_hide_token_and_login() {
         for toml in [
             "[dashboard]\ntoken = 4711",
             "[dashboard]\ntoken = \"4711",

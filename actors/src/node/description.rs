@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn boxes_have_the_sizes_of_the_description_at_a_node_without_a_camera() {
+    fn boxes_use_description_sizes() {
         let text = "[camera.projection.sizes.labels]\ncar = { width_m = 0.18, height_m = 0.12 }\n";
         let set_by = NodeName::from_static("edge");
         let mut held = HeldDescription {

@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_count_is_logged_when_it_has_changed() {
+    fn only_changed_counts_are_logged() {
         let mut logged = LoggedCounts::default();
         let mut line = |sent, lost| {
             let counts = [("sent".to_owned(), sent), ("lost".to_owned(), lost)];

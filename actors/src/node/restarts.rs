@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_burst_is_too_much_and_a_trickle_is_not() {
+    fn only_burst_exceeds_limit() {
         let mut burst = Restarts::default();
         assert_eq!(
             (0..20)

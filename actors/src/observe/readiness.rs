@@ -213,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rounds_that_come_with_packets_only_are_not_waited_for() {
+    fn packet_rounds_are_not_awaited() {
         let mut fusion = FusionConfig::default();
         fusion.round.period_s = 1.0;
         fusion.vote.mode = VoteMode::Paper;

@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pipes_devices_and_directories_are_refused_at_once() {
+    fn pipes_and_directories_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let pipe = folder.path().join("pipe");
         rustix::fs::mknodat(
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_read_up_to_its_bound_and_text_without_a_byte_order_mark() {
+    fn read_is_bounded_without_bom() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("labels.txt");
         std::fs::write(&path, "\u{feff}car\nperson\n").unwrap();
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_the_same_in_the_encodings_and_with_the_line_ends_of_every_system() {
+    fn encodings_give_equal_text() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("labels.txt");
         let text = "car\nF\u{fc}\u{df}e \u{1f697}\n\nlast";

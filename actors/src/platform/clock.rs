@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn time_is_unix_time_and_never_goes_back() {
+    fn unix_time_is_monotonic() {
         let first = now();
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
         assert!(

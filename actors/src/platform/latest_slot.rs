@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn the_latest_value_wins_and_the_others_are_counted() {
+    async fn latest_value_replaces_counted_others() {
         let slot = LatestSlot::default();
         (1..=4).for_each(|value| slot.put(value));
         assert_eq!(slot.take().await, Some(4));
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_waiting_consumer_is_woken_by_a_thread() {
+    async fn waiting_consumer_is_woken() {
         let slot = Arc::new(LatestSlot::default());
         let waiting = tokio::spawn({
             let slot = Arc::clone(&slot);

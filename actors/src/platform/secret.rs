@@ -129,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn logins_of_addresses_are_not_shown_and_uncertain_ones_hide_all() {
+    fn address_logins_are_hidden() {
         for (text, shown) in [
             ("rtsp://user:p@ss@camera:554/1", "rtsp://camera:554/1"),
             (

@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_saved_comes_back_and_half_a_write_does_no_harm() {
+    fn half_write_keeps_saved_state() {
         let directory = tempfile::tempdir().unwrap();
         let file = file(&directory.path().join("made/on/demand"));
         assert_eq!(file.load::<Vec<u32>>(|_| true), None);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn truncated_and_alien_files_are_set_aside() {
+    fn alien_files_are_set_aside() {
         let directory = tempfile::tempdir().unwrap();
         let file = file(directory.path());
         for content in [&b"[1,2"[..], b"", b"\xff\xfe", b"{\"other\":1}"] {
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_of_an_early_version_is_read_and_then_has_a_checksum() {
+    fn old_file_version_gains_checksum() {
         let directory = tempfile::tempdir().unwrap();
         let file = file(directory.path());
         fs::write(file.path(), b"[1,2,3]").unwrap();
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn pipes_among_the_files_delay_no_start() {
+    fn pipes_do_not_delay_start() {
         let directory = tempfile::tempdir().unwrap();
         let [cell, node] = ["lot-1", "edge"].map(NodeName::from_static);
         let file = file(directory.path());
@@ -287,14 +287,14 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_that_cannot_be_written_is_an_error() {
+    fn unwritable_directory_is_error() {
         let directory = tempfile::tempdir().unwrap();
         fs::write(directory.path().join("occupied"), b"").unwrap();
         assert!(file(&directory.path().join("occupied")).save(&[1]).is_err());
     }
 
     #[test]
-    fn a_left_over_file_lends_no_permissions_to_a_secret() {
+    fn leftover_file_widens_no_permissions() {
         use std::os::unix::fs::PermissionsExt;
 
         let directory = tempfile::tempdir().unwrap();

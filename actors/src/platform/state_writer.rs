@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_disk_that_hangs_is_waited_for_once_and_what_changed_meanwhile_is_written() {
+    async fn hanging_disk_is_awaited_once() {
         let directory = tempfile::tempdir().unwrap();
         let lot = NodeName::from_static("lot-1");
         let euclid = NodeName::from_static("euclid");

@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_source_does_not_use_up_what_another_has() {
+    fn sources_have_separate_rates() {
         let mut throttles = KeyedThrottle::per_second(10);
         let mut allowed = |source, ms: u64| {
             (0..1000)
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn a_burst_is_allowed_then_a_rate() {
+    fn burst_is_allowed_then_limited() {
         let mut throttle = TokenBucket::new(3, Duration::from_millis(10), Timestamp(0));
         let mut allowed = |ms: u64| {
             (0..100)

@@ -356,7 +356,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rejected_evidence_does_not_pass_for_rejected_reports() {
+    fn evidence_rejections_count_separately() {
         let counters = Counters::default();
         counters.reject(RejectReason::Unattested, "euclid");
         counters.reject(RejectReason::Superseded, "gauss");
@@ -370,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn a_refusal_that_a_change_explains_is_counted_and_no_trouble() {
+    fn explained_refusal_is_no_trouble() {
         let counters = Counters::default();
         for _ in 0..1000 {
             counters.reject_if_lasting(RejectReason::BadSignature, "euclid");
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn every_reason_and_event_has_its_own_counter() {
+    fn every_reason_has_separate_counter() {
         let counters = Counters::default();
         for (times, reason) in RejectReason::ALL.into_iter().enumerate() {
             (0..times).for_each(|_| counters.reject(reason, "euclid"));

@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_that_logs_every_packet_writes_few_lines() {
+    fn repeated_library_lines_are_limited() {
         let lines = Counter::default();
         let subscriber =
             Registry::default().with(lines.clone().with_filter(LineThrottle::default()));
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_writes_again_after_a_while() {
+    fn limited_line_returns_later() {
         let throttle = LineThrottle::default();
         let written = |second: u64| {
             let at = Timestamp(second * 1_000_000);

@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_guest_that_loses_what_it_got_comes_again_and_then_no_more() {
+    async fn lost_invitation_is_redeemable_once() {
         let Scene {
             directory,
             token,
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn guests_that_have_not_joined_in_time_are_named_and_find_nobody() {
+    async fn late_guests_are_named() {
         let wait = Duration::from_secs(2);
         let began = Instant::now();
         let Scene {
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn of_two_with_one_token_the_later_joins_and_both_are_told_of() {
+    async fn later_of_two_guests_joins() {
         let Scene {
             directory,
             token,
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn strangers_that_say_nothing_hold_a_guest_up_for_as_long_as_a_conversation_may_last() {
+    async fn silent_strangers_delay_guest_briefly() {
         const STRANGERS: usize = host::MAX_VISITS + 6;
         let Scene {
             token,
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn other_names_secrets_and_hosts_get_nothing() {
+    async fn wrong_secret_or_host_is_refused() {
         let Scene {
             token,
             visits,

@@ -13,7 +13,7 @@ use tokio::time::timeout;
 const PATIENCE: Duration = Duration::from_secs(30);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_camera_that_is_missing_is_counted_each_time_and_the_node_lives_on() {
+async fn missing_camera_is_counted() {
     let toml = r#"
         name = "blind"
         dashboard = { enabled = false }
@@ -43,7 +43,7 @@ async fn a_camera_that_is_missing_is_counted_each_time_and_the_node_lives_on() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_node_whose_detector_cannot_be_built_says_why() {
+async fn unbuildable_detector_names_reason() {
     let toml = r#"
         name = "blind"
         role = "cav"
@@ -66,7 +66,7 @@ async fn a_node_whose_detector_cannot_be_built_says_why() {
 
 /// Two cameras back to back report as one witness: the map has what is before and what is behind the vehicle.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_with_two_cameras_sees_both_ways_and_is_one_witness() {
+async fn two_cameras_make_one_witness() {
     let folder = tempfile::tempdir().unwrap();
     let detections = folder.path().join("detections.jsonl");
     let box_ = r#"{"x_min":300,"y_min":220,"x_max":340,"y_max":260}"#;
@@ -128,7 +128,7 @@ async fn a_vehicle_with_two_cameras_sees_both_ways_and_is_one_witness() {
 
 /// The end comes as frame and as status; whichever is taken first, the node says so.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_source_that_ends_is_a_trouble_each_time() {
+async fn each_ended_source_is_trouble() {
     let photos = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");
     for _ in 0..8 {
         let toml = format!(

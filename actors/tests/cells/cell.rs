@@ -84,7 +84,7 @@ async fn reported(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_one_vehicle_sees_reaches_another() {
+async fn vehicle_receives_objects_of_another() {
     let edge = edge().await;
     let euclid = cav("euclid", &edge).await;
     let galileo = cav("galileo", &edge).await;
@@ -105,7 +105,7 @@ async fn what_one_vehicle_sees_reaches_another() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn rounds_go_on_in_order_and_old_ones_are_refused() {
+async fn rounds_keep_order() {
     let edge = edge().await;
     let euclid = cav("euclid", &edge).await;
     let mut newest = euclid.newest_map();
@@ -125,7 +125,7 @@ async fn rounds_go_on_in_order_and_old_ones_are_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_cell_goes_on_when_any_part_is_killed() {
+async fn cell_survives_any_part_loss() {
     let log = tempfile::tempdir().unwrap();
     let record = Some(RecordConfig {
         min_free_mb: 0,
@@ -185,7 +185,7 @@ async fn the_cell_goes_on_when_any_part_is_killed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() {
+async fn killed_supervisor_hands_over() {
     let edge = edge().await;
     let seeds = vec![edge.gossip_address().unwrap().to_string()];
     let mut others = Vec::new();
@@ -226,7 +226,7 @@ async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_part_that_keeps_ending_makes_the_node_give_up() {
+async fn repeatedly_ending_part_stops_node() {
     let mut edge = edge().await;
     for _ in 0..=node::MAX_RESTARTS {
         let fuser = edge.slots().fuser.get().unwrap();
@@ -246,7 +246,7 @@ async fn a_part_that_keeps_ending_makes_the_node_give_up() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
+async fn killed_supervisor_stops_node() {
     let mut edge = edge().await;
     let address = edge.broker_address().unwrap();
     let supervisor = edge
@@ -273,7 +273,7 @@ async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_second_node_of_a_name_takes_no_part_and_says_why() {
+async fn second_namesake_is_refused() {
     let edge = edge().await;
     let near = |name: &str, role| {
         let mut config = config(name, role);
@@ -328,7 +328,7 @@ async fn a_second_node_of_a_name_takes_no_part_and_says_why() {
 
 /// A terminal that is closed ends `top` as `q` does: it leaves the cell, and does not spin on the terminal that is gone.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn top_leaves_the_cell_when_its_terminal_is_closed() {
+async fn top_leaves_when_terminal_closes() {
     let edge = edge().await;
     let (terminal, side) = pty_process::blocking::open().unwrap();
     terminal.resize(pty_process::Size::new(40, 120)).unwrap();
@@ -364,7 +364,7 @@ async fn top_leaves_the_cell_when_its_terminal_is_closed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_busy_port_is_an_error_that_names_it() {
+async fn busy_port_is_named() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
     let config = NodeConfig {

@@ -207,7 +207,7 @@ fn right_votes(node: &NodeHandle, voter: &str) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_nothing() {
+async fn configuration_spreads_within_two_rounds() {
     let edge = start("edge", Role::Edge, &[]).await;
     let euclid = start("euclid", Role::Auto, &[&edge]).await;
     let gauss = start("gauss", Role::Cav, &[&edge]).await;
@@ -353,7 +353,7 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn whoever_joins_later_and_whatever_order_candidates_start_in_the_latest_version_holds() {
+async fn late_joiners_get_latest_version() {
     let states = [(); 3].map(|()| tempfile::tempdir().unwrap());
     let [of_edge, of_euclid, of_gauss] = &states;
     let text = |place: &str| described(&[place], "");
@@ -417,7 +417,7 @@ async fn whoever_joins_later_and_whatever_order_candidates_start_in_the_latest_v
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn sides_of_a_split_that_meet_use_the_later_version_and_of_equal_ones_the_greater_hash() {
+async fn merged_cell_uses_later_description() {
     for of_euclid in [&["b"][..], &["b", "c"]] {
         let edge = start("edge", Role::Edge, &[]).await;
         let euclid = start("euclid", Role::Auto, &[]).await;
@@ -456,7 +456,7 @@ async fn sides_of_a_split_that_meet_use_the_later_version_and_of_equal_ones_the_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_node_whose_own_file_contradicts_says_so_with_both_values_and_goes_on() {
+async fn contradicting_file_is_reported() {
     let state = tempfile::tempdir().unwrap();
     let edge = start("edge", Role::Edge, &[]).await;
     let own = described(&["mine", "slot-1"], "");
@@ -544,7 +544,7 @@ async fn a_node_whose_own_file_contradicts_says_so_with_both_values_and_goes_on(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_candidate_whose_own_file_contradicts_leads_only_if_nobody_else_can() {
+async fn contradicting_candidate_leads_last() {
     let edge = start("edge", Role::Edge, &[]).await;
     let mut of_its_own = config(
         "noether",
@@ -582,7 +582,7 @@ async fn a_candidate_whose_own_file_contradicts_leads_only_if_nobody_else_can() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_candidate_may_start_its_cell_with_a_description_and_does_not_undo_later_ones() {
+async fn starting_description_replaces_no_later() {
     let state = tempfile::tempdir().unwrap();
     let file = state.path().join("cell.toml");
     std::fs::write(&file, described(&["slot-0"], "")).unwrap();

@@ -21,7 +21,7 @@ use path::Path;
 /// A cell of an edge and three vehicles finds together by one seed, goes on without the edge, and gives it the lead
 /// back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn maps_go_on_without_the_edge_and_with_it_again() {
+async fn maps_survive_edge_loss() {
     let mut cell = Cell::new(config);
     for (name, role) in [
         ("edge", Role::Edge),
@@ -60,7 +60,7 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
 
 /// Those that are left find a leader when the leader and the one named to follow it end together.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_outlives_its_leader_and_standby() {
+async fn cell_survives_two_losses() {
     let mut cell = Cell::new(config);
     for name in ["euclid", "gauss", "noether", "turing"] {
         cell.start(name, Role::Auto).await;
@@ -83,7 +83,7 @@ async fn a_cell_outlives_its_leader_and_standby() {
 
 /// A vehicle that finds nobody serves itself, and remembers its term when it starts again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
+async fn lone_vehicle_raises_its_epochs() {
     let mut cell = Cell::new(config);
     cell.start("euclid", Role::Auto).await;
     cell.served_by("euclid").await;
@@ -99,7 +99,7 @@ async fn a_lone_vehicle_serves_itself_in_ever_later_epochs() {
 
 /// A leader that loses its broker stops leading at once; an edge is handed the lead again when it is whole.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
+async fn leader_without_part_yields() {
     let mut cell = Cell::new(config);
     for (name, role) in [("euclid", Role::Edge), ("gauss", Role::Auto)] {
         cell.start(name, role).await;
@@ -126,7 +126,7 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
 
 /// A leader whose broker falls silent makes way for one whose broker does not, and for nobody else.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
+async fn leader_with_silent_broker_yields() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = broker
         .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
@@ -171,7 +171,7 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
 
 /// A vehicle of role `cav` follows whoever leads and never leads itself.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cav_follows_the_election_and_takes_no_part_in_leading() {
+async fn cav_follows_without_leading() {
     let mut cell = Cell::new(config);
     for (name, role) in [
         ("euclid", Role::Auto),

@@ -196,7 +196,7 @@ impl Watched {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_trouble_names_what_happened_to_the_cell() {
+async fn every_trouble_has_its_cause() {
     let mut watched = Watched::new();
     watched.start("edge", Role::Edge).await;
     watched.start("euclid", Role::Auto).await;

@@ -118,7 +118,7 @@ async fn five() -> Vec<Node> {
 }
 
 #[tokio::test]
-async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
+async fn five_nodes_notice_death() {
     let mut nodes = five().await;
     let dead = nodes.remove(2);
     dead.actor.kill();
@@ -134,7 +134,7 @@ async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
 }
 
 #[tokio::test]
-async fn datagrams_and_broker_addresses_reach_the_others() {
+async fn datagrams_reach_other_nodes() {
     let mut nodes = five().await;
     let payload = Bytes::from_static(b"who leads?");
     let reached = |members: &Vec<Seen>| {
@@ -175,7 +175,7 @@ async fn datagrams_and_broker_addresses_reach_the_others() {
 }
 
 #[tokio::test]
-async fn nodes_find_each_other_by_multicast() {
+async fn multicast_connects_nodes() {
     let probe = std::net::UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
     let port = probe.local_addr().unwrap().port();
     drop(probe);
@@ -217,7 +217,7 @@ async fn loopback_has_multicast(config: &MulticastConfig) -> bool {
 }
 
 #[tokio::test]
-async fn a_node_with_another_key_is_not_seen_and_counted() {
+async fn other_key_is_ignored() {
     let first = Node::start("node-1", config(&[])).await;
     let wrong = MembershipConfig {
         key: Some(Secret::new("another passphrase")),
@@ -247,7 +247,7 @@ async fn a_node_with_another_key_is_not_seen_and_counted() {
 }
 
 #[tokio::test]
-async fn garbage_is_counted_and_changes_nothing() {
+async fn garbage_is_counted_and_ignored() {
     let mut nodes = five().await;
     let before = nodes[0].changes();
     let stranger = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();

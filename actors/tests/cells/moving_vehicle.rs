@@ -95,7 +95,7 @@ async fn next(events: &mut EventLoop, topic: &str) -> ObjectReport {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_that_drives_sees_from_where_it_was() {
+async fn moving_vehicle_uses_past_pose() {
     let directory = tempfile::tempdir().unwrap();
     let localisation = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let poses = free_address().await;
@@ -254,7 +254,7 @@ async fn report_from(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn poses_on_earth_follow_the_origin_of_the_cell() {
+async fn earth_poses_use_cell_origin() {
     let directory = tempfile::tempdir().unwrap();
     let edge = edge().await;
     let seeds = vec![edge.gossip_address().unwrap().to_string()];

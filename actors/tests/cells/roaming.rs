@@ -361,7 +361,7 @@ impl Driving {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_reports_in_the_cell_in_which_it_is_and_never_in_two() {
+async fn vehicle_reports_in_one_cell() {
     let mut town = Town::new(&[0, 1]).await;
     let first = town.reports(0).await;
     let second = town.reports(1).await;
@@ -430,7 +430,7 @@ async fn counts(node: &NodeHandle, is_expected: bool) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_certificate_of_the_city_takes_a_vehicle_through_all_cells() {
+async fn city_certificate_opens_all_cells() {
     let mut town = Town::certified(&[0, 1]).await;
     let vehicle = Driving::start(Roamer::start(town.vehicle(Role::Cav)).await.unwrap());
     counts(&town.edges[&0], true).await;
@@ -442,7 +442,7 @@ async fn one_certificate_of_the_city_takes_a_vehicle_through_all_cells() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_leads_at_home_alone_and_follows_elsewhere() {
+async fn vehicle_leads_only_at_home() {
     let mut town = Town::new(&[1]).await;
     let elsewhere = town.reports(1).await;
     let config = town.vehicle(Role::Auto);
@@ -469,7 +469,7 @@ async fn a_vehicle_leads_at_home_alone_and_follows_elsewhere() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_that_cannot_know_where_it_is_says_so() {
+async fn vehicle_without_position_reports_trouble() {
     let mut town = Town::new(&[0]).await;
     let mut config = town.vehicle(Role::Cav);
     config.pose.listen = Some(loopback());
@@ -497,7 +497,7 @@ async fn a_vehicle_that_cannot_know_where_it_is_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_stays_in_its_cell_where_the_next_one_does_not_answer() {
+async fn silent_next_cell_keeps_vehicle() {
     let mut town = Town::new(&[0]).await;
     let reports = town.reports(0).await;
     let vehicle = Driving::start(Roamer::start(town.vehicle(Role::Cav)).await.unwrap());

@@ -59,7 +59,7 @@ fn ids(map: &GlobalMap) -> Vec<Uuid> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_that_only_tracks_rates_its_vehicles_and_keeps_identities_when_its_fuser_restarts() {
+async fn tracking_cell_keeps_identities() {
     let edge = node::start(config("edge", Role::Edge)).await.unwrap();
     let mut config = config("euclid", Role::Cav);
     config.mqtt.broker = edge.broker_address().map(Into::into);

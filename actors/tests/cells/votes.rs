@@ -123,7 +123,7 @@ async fn unmasked(reporter: &NodeHandle, receiver: &NodeHandle) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn vehicles_that_disagree_get_a_verdict_and_reputations() {
+async fn disagreeing_vehicles_get_verdict() {
     let edge = edge(|_| ()).await;
     let euclid = cav("euclid", &edge).await;
     let agreed = OnceCell::new();
@@ -187,7 +187,7 @@ async fn retained_reputations(edge: &NodeHandle) -> Reputations {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_restarted_node_goes_on_with_its_reputations() {
+async fn restarted_node_keeps_reputations() {
     for mode in [VoteMode::Weighted, VoteMode::Paper] {
         let directory = tempfile::tempdir().unwrap();
         let keep = |config: &mut NodeConfig| {
@@ -218,7 +218,7 @@ async fn a_restarted_node_goes_on_with_its_reputations() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_broken_state_does_not_stop_a_node() {
+async fn corrupt_state_stops_no_node() {
     let spoil_file = |directory: &Path| {
         std::fs::write(directory.join("crossing.edge.reputations.json"), b"{\"sch")
     };
@@ -257,7 +257,7 @@ async fn a_broken_state_does_not_stop_a_node() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
+async fn restarted_parts_keep_reputations() {
     let edge = edge(|_| ()).await;
     let euclid = cav("euclid", &edge).await;
     unmasked(&euclid, &euclid).await;
@@ -287,7 +287,7 @@ async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn another_candidate_leads_with_the_same_reputations() {
+async fn next_leader_keeps_reputations() {
     let edge = edge(|_| ()).await;
     // It never settles a vote itself: what it knows, it was told.
     let standby = member("standby", Role::Auto, &edge, |config| {
@@ -363,7 +363,7 @@ async fn another_candidate_leads_with_the_same_reputations() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_runs_what_it_is_told_and_counts_the_rest() {
+async fn only_configured_algorithms_accept_reports() {
     for (algorithms, kind, other) in [
         (
             Algorithms::Pace,
@@ -405,7 +405,7 @@ async fn a_cell_runs_what_it_is_told_and_counts_the_rest() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn votes_that_cannot_count_are_counted() {
+async fn unusable_votes_are_counted() {
     let edge = edge(|_| ()).await;
     let euclid = cav("euclid", &edge).await;
     let send = |report: &Arc<ObjectReport>| {

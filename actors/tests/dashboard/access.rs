@@ -8,7 +8,7 @@ use crate::cell::{config, start};
 use crate::http::{get, get_with, request};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_the_token_nothing_but_health_is_told() {
+async fn only_health_needs_no_token() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.token = Some(Secret::new("correct-horse-battery"));
     let (node, page) = start(config).await;
@@ -65,7 +65,7 @@ async fn without_the_token_nothing_but_health_is_told() {
 
 /// A form escapes `+` and `/`, which a token in an address may have as they are.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_person_without_the_token_gets_a_form_for_it() {
+async fn browser_without_token_gets_form() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.token = Some(Secret::new("correct+horse/battery"));
     let (node, page) = start(config).await;
@@ -85,7 +85,7 @@ async fn a_person_without_the_token_gets_a_form_for_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_page_of_elsewhere_cannot_look_through_a_browser_here() {
+async fn foreign_page_is_refused() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
     assert_eq!(
         get_with(page, "/api/picture", &[("Host", "rebound.example:8080")])

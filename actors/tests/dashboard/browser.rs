@@ -26,7 +26,7 @@ const IS_READY: &str =
 /// also to those who do not see it. Leaves pictures of the page in `target/dashboard`.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
+async fn browser_follows_new_leader() {
     let pictures = Path::new(env!("CARGO_TARGET_TMPDIR"))
         .parent()
         .unwrap()
@@ -149,7 +149,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
 /// and says so until others are closed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
+async fn link_signs_in_excess_page_polls() {
     let browser = Browser::start().await;
     let mut guarded = config("euclid", Role::Auto, 1);
     guarded.dashboard.token = Some(Secret::new("correct-horse-battery"));
@@ -203,7 +203,7 @@ const WITHOUT_THE_LATEST: &str = "for (const [of, names] of [[Map, ['groupBy']],
 /// Browsers of some years ago show the map, and where something cannot be drawn the page does not look well.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so() {
+async fn old_browser_shows_map_or_explains() {
     let (node, page) = cell::start(config("euclid", Role::Auto, 12)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 12);
     let browser = Browser::start().await;
@@ -242,7 +242,7 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn every_table_that_goes_on_shows_it_by_a_shadow() {
+async fn cut_off_table_shows_shadow() {
     let (node, page) = cell::start(config("euclid", Role::Auto, 24)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 24);
     let directory = tempfile::tempdir().unwrap();
@@ -335,7 +335,7 @@ const FAR_M: f64 = 9e7;
 /// A vehicle that is told a wrong pose does not rule the map. It is pointed to, and shown on demand.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_wrong_position_is_got_over() {
+async fn wrong_position_distorts_no_map() {
     let (node, page) = cell::start(config("euclid", Role::Auto, 12)).await;
     let mut stray = Stray::start(node.broker_address().unwrap());
     let browser = Browser::start().await;

@@ -93,7 +93,7 @@ async fn sees_objects(page: SocketAddr) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn pictures_are_made_while_somebody_looks_and_five_a_second_at_most() {
+async fn pictures_need_viewers() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing(directory.path())).await;
     sees_objects(page).await;
@@ -142,7 +142,7 @@ async fn pictures_are_made_while_somebody_looks_and_five_a_second_at_most() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_camera_that_is_not_to_be_shown_is_not() {
+async fn hidden_camera_is_not_served() {
     let directory = tempfile::tempdir().unwrap();
     let mut private = seeing(directory.path());
     private.dashboard.camera = false;
@@ -161,7 +161,7 @@ async fn a_camera_that_is_not_to_be_shown_is_not() {
 /// The picture is on the page with its boxes; a box and its object on the map light up together, either way.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_box_and_its_object_light_up_together() {
+async fn box_and_object_highlight_together() {
     let shots = shots();
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing(directory.path())).await;
@@ -243,7 +243,7 @@ async fn a_box_and_its_object_light_up_together() {
 
 /// Each camera's pictures are of their own, and made while somebody looks at that camera.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_pictures_of_each_camera_are_had_by_its_name() {
+async fn camera_name_selects_pictures() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing_both_ways(directory.path())).await;
     assert_eq!(
@@ -282,7 +282,7 @@ async fn the_pictures_of_each_camera_are_had_by_its_name() {
 /// A camera is chosen by its name; its boxes light up with the objects behind the vehicle. Points for its mount are its own.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn each_of_several_cameras_can_be_looked_at() {
+async fn each_camera_can_be_viewed() {
     let shots = shots();
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing_both_ways(directory.path())).await;

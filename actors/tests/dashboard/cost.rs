@@ -27,7 +27,7 @@ async fn usage(page: SocketAddr) -> [f64; 2] {
 /// browser. The figures are of use from an optimised build only.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a measurement: make test-dashboard"]
-async fn what_a_node_costs_with_32_vehicles() {
+async fn cost_with_32_vehicles() {
     let directory = tempfile::tempdir().unwrap();
     let places = free_places::<1>();
     let [place] = places;

@@ -11,7 +11,7 @@ const PAGE: &str = include_str!("../../../clients/web/map.html");
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_page_of_the_nodes_host_shows_the_map_and_one_of_another_name_does_not() {
+async fn only_host_page_shows_map() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     tokio::spawn(async move {

@@ -10,7 +10,7 @@ use crate::cell::{config, join, start, until};
 use crate::http::{get, try_request};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_is_ready_when_it_follows_a_leader_that_publishes() {
+async fn vehicle_is_ready_behind_leader() {
     let (cav, page) = start(config("euclid", Role::Cav, 2)).await;
     assert_eq!(
         (
@@ -53,7 +53,7 @@ async fn a_vehicle_is_ready_when_it_follows_a_leader_that_publishes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_busy_port_is_counted_and_taken_as_soon_as_it_is_free() {
+async fn busy_page_port_is_retried() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
     let mut config = config("euclid", Role::Auto, 1);
@@ -82,7 +82,7 @@ async fn a_busy_port_is_counted_and_taken_as_soon_as_it_is_free() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nodes_that_are_told_no_address_have_a_page_each_on_this_machine_only() {
+async fn default_pages_are_loopback_only() {
     let unplaced = |name| {
         let mut config = config(name, Role::Cav, 1);
         config.dashboard = DashboardConfig::default();
@@ -108,7 +108,7 @@ async fn nodes_that_are_told_no_address_have_a_page_each_on_this_machine_only() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_page_that_is_switched_off_is_not_there() {
+async fn disabled_page_does_not_listen() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.enabled = false;
     let node = ecod_actors::node::start(config).await.unwrap();
@@ -122,7 +122,7 @@ async fn a_page_that_is_switched_off_is_not_there() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_page_that_was_killed_comes_back_where_it_was() {
+async fn killed_page_keeps_its_address() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
     node.slots().dashboard.get().unwrap().kill();
     until("it answers again", || async {

@@ -37,7 +37,7 @@ async fn longest_gap<T>(node: &NodeHandle, during: impl Future<Output = T>) -> (
 const MOST: Duration = Duration::from_secs(2);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn browsers_that_never_read_are_left_behind() {
+async fn non_reading_browsers_are_dropped() {
     let (node, page) = start(config("edge", Role::Edge, 600)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 600);
     until("the node is ready", || async {
@@ -84,7 +84,7 @@ async fn browsers_that_never_read_are_left_behind() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn ten_thousand_messages_from_a_browser_are_slowed_down_and_counted() {
+async fn browser_message_flood_is_limited() {
     let (node, page) = start(config("edge", Role::Edge, 20)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 20);
     until("the node is ready", || async {
@@ -122,7 +122,7 @@ async fn flood(page: SocketAddr, requests: usize) {
 
 /// Whoever does not know the token takes no answers from those who do.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_flood_without_the_token_slows_down_nobody_who_has_it() {
+async fn tokenless_flood_delays_no_user() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.token = Some(Secret::new("correct-horse-battery"));
     let (node, page) = start(config).await;
@@ -150,7 +150,7 @@ async fn a_flood_without_the_token_slows_down_nobody_who_has_it() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn connections_that_say_nothing_give_way_and_are_closed_soon() {
+async fn silent_connections_are_displaced() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
     let most = DashboardConfig::default().max_connections;
     let mut silent = Vec::new();
@@ -178,7 +178,7 @@ async fn connections_that_say_nothing_give_way_and_are_closed_soon() {
 
 /// A page looks at live pictures and asks for more now and then, on connections that browsers would keep.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn as_many_pages_as_may_be_open_leave_room_for_machines() {
+async fn pages_leave_room_for_scrapers() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.max_connections = 8;
     let (node, page) = start(config).await;

@@ -87,7 +87,7 @@ fn shots() -> PathBuf {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
+async fn far_object_is_indicated() {
     let (node, page) = start(tracking(12)).await;
     let _vehicles = watch(node.broker_address().unwrap());
     let browser = Browser::start().await;
@@ -324,7 +324,7 @@ fn with_plan(directory: &Path) -> NodeConfig {
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
+async fn floor_plan_lies_under_map() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(with_plan(directory.path())).await;
     let answer = get(page, "/api/floor_plan").await;
@@ -391,7 +391,7 @@ async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
 
 /// A node whose floor plan cannot be shown does not start, and says why.
 #[tokio::test]
-async fn a_floor_plan_that_is_no_image_ends_the_start() {
+async fn invalid_floor_plan_stops_start() {
     let directory = tempfile::tempdir().unwrap();
     let image = directory.path().join("plan.png");
     std::fs::write(&image, "no image").unwrap();

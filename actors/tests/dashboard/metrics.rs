@@ -47,7 +47,7 @@ async fn scrape(page: SocketAddr) -> BTreeMap<String, f64> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn metrics_say_what_the_node_does() {
+async fn metrics_describe_node_activity() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;
     let before = scrape(page).await;
     assert_eq!(
@@ -90,7 +90,7 @@ async fn metrics_say_what_the_node_does() {
 
 /// Sums over nodes must be over those of one cell.
 #[test]
-fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
+fn grafana_shows_one_cell() {
     let text = include_str!("../../../packaging/grafana/ecod.json");
     let dashboard: Value = serde_json::from_str(text).unwrap();
     let variables = dashboard["templating"]["list"].as_array().unwrap();
@@ -129,7 +129,7 @@ fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
 
 /// The page has words for everything that is counted and is not as it should be, and Grafana shows it and nothing else.
 #[test]
-fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
+fn every_loss_counter_is_displayed() {
     const USUAL: [Event; 18] = [
         Event::Published,
         Event::Received,
@@ -184,7 +184,7 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
 
 /// A value that many ask for is read once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn two_that_scrape_at_once_get_the_same() {
+async fn concurrent_scrapes_get_equal_values() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;
     until("the node is ready", || async {
         get(page, "/readyz").await.status == 200

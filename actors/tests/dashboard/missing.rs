@@ -64,7 +64,7 @@ async fn troubles(page: SocketAddr) -> Vec<[String; 2]> {
 /// A node that crashed is named on every page, in health and metrics, with the time at which it was last seen, until an
 /// operator dismisses it at one node.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_node_that_crashed_is_missing_until_it_is_dismissed() {
+async fn crashed_node_stays_missing() {
     let mut cell = three().await;
     let pages = ["edge", "euclid"].map(|node| page(&cell, node));
     let early = cell.node("edge").listens_at().unwrap();
@@ -135,7 +135,7 @@ async fn dismiss(door: SocketAddr, node: &'static str) -> (bool, String) {
 
 /// A node that is stopped in order has left and is not missing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_node_that_is_stopped_in_order_is_not_missing() {
+async fn stopped_node_is_not_missing() {
     let (edge, edge_page) = crate::cell::start(config("edge", Role::Edge, 1)).await;
     let (cav, _) = crate::cell::join(config("euclid", Role::Cav, 1), &edge).await;
     until("the edge has a member", || async {

@@ -100,7 +100,7 @@ async fn reports(page: SocketAddr, reporter: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn points_give_the_mount_of_the_named_camera_and_the_wrong_one_is_named() {
+async fn points_give_named_camera_mount() {
     let directory = tempfile::tempdir().unwrap();
     let mut both = seeing_both_ways(directory.path());
     both.pose.x_m = 10.0;
@@ -199,7 +199,7 @@ async fn points_give_the_mount_of_the_named_camera_and_the_wrong_one_is_named() 
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_a_pose_or_points_that_come_there_is_no_mount() {
+async fn mount_needs_pose_and_points() {
     let directory = tempfile::tempdir().unwrap();
     let mut lost = seeing(directory.path());
     lost.pose.listen = Some(SocketAddr::from(([127, 0, 0, 1], 0)));
@@ -228,7 +228,7 @@ async fn without_a_pose_or_points_that_come_there_is_no_mount() {
 /// Points are clicked in the picture and on the map; the page shows the mount, and the point that contradicts the others.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_mount_is_clicked_corrected_and_copied_in_the_page() {
+async fn mount_is_corrected_in_page() {
     let directory = tempfile::tempdir().unwrap();
     let mut seeing = seeing(directory.path());
     seeing.landmarks = config("euclid", Role::Auto, 6).landmarks;

@@ -32,7 +32,7 @@ fn node_of<'a>(picture: &'a Value, name: &str) -> &'a Value {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn pictures_follow_the_cell_on_every_node() {
+async fn every_node_page_shows_cell() {
     let (edge, edge_page) = start(config("edge", Role::Edge, 6)).await;
     let (cav, cav_page) = join(config("euclid", Role::Cav, 6), &edge).await;
     let vehicles = Vehicles::start(&[edge.broker_address().unwrap()], 4, 6);
@@ -77,7 +77,7 @@ async fn pictures_follow_the_cell_on_every_node() {
 
 /// Neither the edge nor a plain client can be told of any more by the broker that died with the edge.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_leader_that_dies_with_the_only_broker_is_gone_and_so_is_who_only_it_told_of() {
+async fn dead_brokers_clients_are_removed() {
     let directory = tempfile::tempdir().unwrap();
     let places: [Place; 2] = free_places();
     let mut edge = processes::start("edge", Role::Edge, places[0], &places, directory.path());
@@ -136,7 +136,7 @@ async fn say_there_is(name: &'static str, broker: SocketAddr) {
 
 /// A vehicle's report reaches a node that only follows while someone looks there, and no longer.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_follower_takes_reports_only_while_it_is_looked_at() {
+async fn unviewed_follower_receives_no_reports() {
     let (edge, _) = start(config("edge", Role::Edge, 6)).await;
     let (cav, page) = join(config("euclid", Role::Cav, 6), &edge).await;
     let _vehicles = Vehicles::start(&[edge.broker_address().unwrap()], 1, 6);
@@ -169,7 +169,7 @@ async fn a_follower_takes_reports_only_while_it_is_looked_at() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn history_tells_who_led_and_how_it_went() {
+async fn history_lists_leaders_and_gaps() {
     let (edge, _) = start(config("edge", Role::Edge, 2)).await;
     let (auto, page) = join(config("euclid", Role::Auto, 2), &edge).await;
     until("the edge is followed", || async {

@@ -47,7 +47,7 @@ async fn pictures(browser: &Browser, name: &str) {
 /// After the edge was killed, the page has a band for each leader, and goes back to the map of before and to now.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_browser_scrubs_back_to_the_map_before_the_edge_was_lost() {
+async fn browser_scrubs_back() {
     let directory = tempfile::tempdir().unwrap();
     let places: [Place; 2] = free_places();
     let [at_edge, at_euclid] = places;
@@ -128,7 +128,7 @@ async fn a_browser_scrubs_back_to_the_map_before_the_edge_was_lost() {
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_report_shows_what_was_seen_at_the_cursor() {
+async fn report_shows_map_at_cursor() {
     let directory = tempfile::tempdir().unwrap();
     let [log, frames, detections, page] = ["log", "frames", "detections.jsonl", "report.html"]
         .map(|name| directory.path().join(name));

@@ -77,7 +77,7 @@ async fn until_told(page: SocketAddr, expected: [&str; 3], cause: &str) {
 /// A client whose reports cannot be read and one whose clock is off are named with field and figure, on every page of the
 /// cell and in the metrics; and they are forgotten when they are gone.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_leader_sees_is_on_every_page() {
+async fn leader_troubles_reach_every_page() {
     let (edge, edge_page) = start(config("edge", Role::Edge, 2)).await;
     let (cav, page) = join(config("euclid", Role::Cav, 2), &edge).await;
     let broker = edge.broker_address().unwrap();
@@ -112,7 +112,7 @@ async fn what_the_leader_sees_is_on_every_page() {
 
 /// A vehicle whose reports the leader refuses knows it, and is not ready.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_is_told_that_its_reports_are_refused() {
+async fn refused_reports_make_vehicle_unready() {
     let (edge, _) = start(config("edge", Role::Edge, 2)).await;
     let (cav, page) = join(config("euclid", Role::Cav, 2), &edge).await;
     until("it follows", || async {
@@ -193,7 +193,7 @@ async fn who_is_alone_says_why() {
 
 /// The leader names the sender of reports that it does not take: of the other algorithm, or too many.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn reports_that_are_not_taken_are_named_with_their_sender() {
+async fn refused_reports_name_sender() {
     let mut voting = config("edge", Role::Edge, 1);
     voting.fusion.algorithms = Algorithms::Vote;
     voting.mqtt.max_report_hz = 4;
@@ -218,7 +218,7 @@ async fn reports_that_are_not_taken_are_named_with_their_sender() {
 
 /// A broker that is there and refuses the login.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_broker_that_refuses_is_named_with_its_answer() {
+async fn refusing_broker_is_named() {
     let broker = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = broker.local_addr().unwrap().to_string();
     let mut refused = config("euclid", Role::Cav, 1);
@@ -275,7 +275,7 @@ fn watching(
 /// A camera that is not there, one whose pose nobody sends, and one that sees what has no size.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_camera_lacks_is_named() {
+async fn missing_camera_settings_are_named() {
     let directory = tempfile::tempdir().unwrap();
     let seen = r#"[{"label":"dragon","confidence":0.9,"bounding_box":{"x_min":30,"y_min":20,"x_max":34,"y_max":24}}]"#;
     let with_camera = |name: &str| watching(name, directory.path(), [64, 48], seen, "");
@@ -300,7 +300,7 @@ async fn what_a_camera_lacks_is_named() {
 /// A camera so near that the image's edge cuts whatever it sees.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason() {
+async fn unplaced_detections_name_reason() {
     let directory = tempfile::tempdir().unwrap();
     let seen = r#"[{"label":"person","confidence":0.9,"bounding_box":{"x_min":0,"y_min":0,"x_max":64,"y_max":48}}]"#;
     let near = watching(
@@ -323,7 +323,7 @@ async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason(
 /// A camera that looks 6° higher than its mount says, at people who stand 4 to 15 m away.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_camera_that_has_turned_is_named_with_its_angle() {
+async fn turned_camera_names_angle() {
     let directory = tempfile::tempdir().unwrap();
     let focal_px = 530.0;
     let camera_m = 1.5;

@@ -66,7 +66,7 @@ fn commands(document: &str, section: &str) -> Vec<String> {
 
 /// The first two blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_documented_commands_of_mosquitto_report_and_receive() {
+async fn documented_mosquitto_commands_work() {
     let is_installed = found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]);
     assert!(
         is_installed,
@@ -138,7 +138,7 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
 
 /// The third block is run as it is, but for directory and port.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
+async fn documented_mosquitto_commands_work_with_certificate() {
     let directory = tempfile::tempdir().unwrap();
     let cell = NodeName::from_static("lot-1");
     let name = NodeName::from_static("edge");

@@ -64,7 +64,7 @@ pub(crate) async fn reported(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_gets_what_its_node_accepts_also_when_the_leader_is_killed() {
+async fn maps_survive_leader_kill() {
     let mut cell = Cell::of_four().await;
     let mut programs = Vec::new();
     for name in ["edge", "gauss", "noether", "euclid"] {
@@ -141,7 +141,7 @@ async fn a_program_gets_what_its_node_accepts_also_when_the_leader_is_killed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_detector_at_the_door_of_any_node_is_heard_whoever_leads() {
+async fn any_broker_port_accepts_detector() {
     let mut cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
     let radar = Program::connect("radar", cell.door("noether"), &[]).await;
@@ -155,7 +155,7 @@ async fn a_detector_at_the_door_of_any_node_is_heard_whoever_leads() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_report_at_a_door_reaches_the_leader_and_its_standby_once() {
+async fn leader_and_standby_get_report_once() {
     let cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
     // Each aggregator counts what it rejects by sender.
@@ -188,7 +188,7 @@ async fn a_report_at_a_door_reaches_the_leader_and_its_standby_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_sees_statuses_reputations_and_the_reports_of_all() {
+async fn program_receives_all_messages() {
     let cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("gauss"), &[]).await;
     let filters = ["nodes/+", "reputations", "detections/+"];
@@ -263,7 +263,7 @@ async fn a_program_sees_statuses_reputations_and_the_reports_of_all() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_claim_of_another_name_is_refused_aloud() {
+async fn foreign_name_is_refused() {
     let cell = Cell::of_four().await;
     for name in ["euclid", "noether"] {
         let program = Program::connect(
@@ -347,7 +347,7 @@ async fn a_claim_of_another_name_is_refused_aloud() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_log_names_a_refused_program_once() {
+async fn refused_program_is_logged_once() {
     let node = Node::start();
     let program = Program::connect("mallory", node.door().await, &[]).await;
     for topic in ["global_detections", "global_verdicts", "global_detections"] {
@@ -365,7 +365,7 @@ async fn the_log_names_a_refused_program_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn votes_at_the_door_of_a_follower_are_in_the_verdicts_at_another() {
+async fn follower_port_accepts_votes() {
     let cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
     let display = Program::connect("display", cell.door("noether"), &["global_verdicts"]).await;
@@ -402,7 +402,7 @@ async fn votes_at_the_door_of_a_follower_are_in_the_verdicts_at_another() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_that_floods_costs_its_node_and_the_cell_nothing() {
+async fn flooding_program_is_harmless() {
     let cell = Cell::of_four().await;
     let flood = Program::connect("flood", cell.door("euclid"), &[]).await;
     let quiet = Program::connect("radar", cell.door("noether"), &[]).await;
@@ -436,7 +436,7 @@ async fn a_program_that_floods_costs_its_node_and_the_cell_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_door_is_the_same_with_an_external_broker() {
+async fn external_broker_keeps_broker_port() {
     let mut outside = EmbeddedBroker::new(BrokerConfig::default());
     let broker = outside
         .start(std::net::SocketAddr::from(([127, 0, 0, 1], 0)))
@@ -472,7 +472,7 @@ async fn the_door_is_the_same_with_an_external_broker() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_door_can_be_switched_off() {
+async fn broker_port_can_be_disabled() {
     let cell = Cell::of_four_with(|config| config.broker.door = false).await;
     assert_eq!(cell.node("euclid").listens_at(), None);
     assert!(cell.node("noether").listens_at().is_some(), "for nodes");

@@ -21,7 +21,7 @@ use region::{Broker, Subscriber, assert_in_order};
 
 /// A subscriber gets two maps a second, and at any time later the leader's status and the cell's description.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_region_gets_maps_at_their_rate_and_keeps_status_and_description() {
+async fn region_map_rate_is_limited() {
     for broker in Broker::both() {
         let subscriber = Subscriber::new(&broker.address());
         let directory = tempfile::tempdir().unwrap();

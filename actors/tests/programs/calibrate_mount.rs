@@ -86,7 +86,7 @@ fn is_near(found: [f64; 6], tolerance: [f64; 6]) {
 }
 
 #[test]
-fn points_give_the_whole_mount_name_the_wrong_one_and_leave_the_rest_of_the_file_alone() {
+fn points_update_mount_in_file() {
     let directory = workplace();
     let vehicle = Pose::new(10.0, -5.0, TAU / 4.0);
     let posed = PosedCamera::new(real().camera_pose(&vehicle), &real(), camera());
@@ -250,7 +250,7 @@ fn people(at_s: f64) -> Vec<Detection> {
 }
 
 #[test]
-fn people_who_walk_give_height_and_tilt_and_what_is_not_there_is_told() {
+fn people_give_height_and_tilt() {
     let directory = workplace();
     let frames = directory.path().join("frames");
     std::fs::create_dir(&frames).unwrap();
@@ -300,7 +300,7 @@ fn people_who_walk_give_height_and_tilt_and_what_is_not_there_is_told() {
 }
 
 #[test]
-fn a_photograph_without_the_board_is_named() {
+fn photograph_without_board_is_named() {
     let directory = workplace();
     let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
     std::fs::write(

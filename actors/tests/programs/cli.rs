@@ -25,7 +25,7 @@ fn printed(environment: &[(&str, &str)]) -> Output {
 }
 
 #[test]
-fn environment_values_that_look_like_numbers_are_text_where_text_is_wanted() {
+fn numeric_environment_text_is_accepted() {
     let environment = [
         ("ECOD_CELL", "42"),
         ("ECOD_NAME", "007"),
@@ -53,7 +53,7 @@ fn environment_values_that_look_like_numbers_are_text_where_text_is_wanted() {
 }
 
 #[test]
-fn variables_of_a_container_platform_do_not_stop_a_node() {
+fn platform_variables_are_ignored() {
     let output = printed(&[
         ("ECOD_SERVICE_HOST", "10.0.0.9"),
         ("ECOD_SERVICE_PORT", "1883"),
@@ -78,7 +78,7 @@ fn variables_of_a_container_platform_do_not_stop_a_node() {
 }
 
 #[test]
-fn a_source_given_as_text_is_refused_without_its_password() {
+fn refused_text_source_hides_password() {
     for source in [
         "rtsp://admin:Geh/eim1@camera/1",
         "rtsp://admin:Geh eim1@camera/1",
@@ -93,7 +93,7 @@ fn a_source_given_as_text_is_refused_without_its_password() {
 }
 
 #[test]
-fn errors_in_the_environment_name_the_variable_and_show_no_password() {
+fn environment_errors_hide_password() {
     let output = printed(&[
         ("ECOD_MQTT__KEEP_ALIVE_S", "soon"),
         ("ECOD_MQTT__PASSWORD", "hush4711"),
@@ -123,7 +123,7 @@ fn errors_in_the_environment_name_the_variable_and_show_no_password() {
 }
 
 #[test]
-fn a_misspelt_key_is_answered_with_the_key_that_was_meant() {
+fn misspelt_key_suggests_right_one() {
     for (toml, key, meant) in [
         ("nmae = \"ada\"", "nmae", "name"),
         (
@@ -150,7 +150,7 @@ fn a_misspelt_key_is_answered_with_the_key_that_was_meant() {
 
 /// Every command that writes a file takes its name by the same flag, and still by its former one.
 #[test]
-fn files_to_write_are_named_by_output() {
+fn output_flag_names_written_files() {
     for (command, former) in [
         ("replay", None),
         ("report", None),
@@ -180,7 +180,7 @@ fn files_to_write_are_named_by_output() {
 }
 
 #[test]
-fn the_page_is_there_unless_it_is_switched_off() {
+fn page_is_enabled_by_default() {
     let off = ("ECOD_DASHBOARD__ENABLED", "false");
     for (environment, flags, enabled, listen) in [
         (None, &[][..], true, None),
@@ -217,7 +217,7 @@ fn the_page_is_there_unless_it_is_switched_off() {
 }
 
 #[test]
-fn only_what_is_not_a_default_is_printed_on_request() {
+fn only_changed_settings_are_printed() {
     let changed = |environment: &[(&str, &str)]| {
         let mut command = ecod_node();
         command
@@ -249,7 +249,7 @@ fn only_what_is_not_a_default_is_printed_on_request() {
 
 /// A period in milliseconds is warned of by the node that starts and by `doctor`, with key, value and remedy.
 #[test]
-fn values_in_another_unit_are_named_at_the_start_and_by_doctor() {
+fn wrong_units_are_named() {
     let mut file = tempfile::NamedTempFile::new().unwrap();
     let offline = "listen = \"127.0.0.1:0\"\n[membership]\nbind = \"127.0.0.1:0\"\nmulticast = { enabled = false }\n\
         [dashboard]\nenabled = false\n";
@@ -286,7 +286,7 @@ fn values_in_another_unit_are_named_at_the_start_and_by_doctor() {
 }
 
 #[test]
-fn a_listening_address_without_ip_is_told_what_is_missing() {
+fn incomplete_listening_address_is_explained() {
     for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
         let output = ecod_node()
             .args(["--role", "edge", "--listen", listen])
@@ -303,7 +303,7 @@ fn a_listening_address_without_ip_is_told_what_is_missing() {
 }
 
 #[test]
-fn a_reader_that_has_seen_enough_is_no_failure() {
+fn closed_pipe_is_no_failure() {
     for arguments in [&["schema"][..], &["--role", "edge", "--print-config"]] {
         let mut node = ecod_node()
             .args(arguments)
@@ -322,7 +322,7 @@ fn a_reader_that_has_seen_enough_is_no_failure() {
 }
 
 #[test]
-fn startup_errors_are_plain_and_name_what_is_wrong() {
+fn startup_errors_name_cause() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap().to_string();
     let gossip = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -377,7 +377,7 @@ fn startup_errors_are_plain_and_name_what_is_wrong() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn ranging_by_the_ground_asks_for_the_height_of_the_camera() {
+fn ground_ranging_requires_camera_height() {
     let mut file = tempfile::NamedTempFile::new().unwrap();
     let camera =
         "source = { kind = \"images\", path = \"frames\" }\ndetector = { kind = \"coco\" }";
@@ -416,7 +416,7 @@ fn ranging_by_the_ground_asks_for_the_height_of_the_camera() {
 }
 
 #[test]
-fn an_observer_that_cannot_record_says_so_and_ends() {
+fn observer_that_cannot_record_exits() {
     let file = tempfile::NamedTempFile::new().unwrap();
     let dir = file.path().join("log");
     let output = ecod_node()
@@ -434,7 +434,7 @@ fn an_observer_that_cannot_record_says_so_and_ends() {
 }
 
 #[test]
-fn a_node_ends_with_its_standard_input_when_told_to() {
+fn node_ends_with_standard_input() {
     let mut node = ecod_node();
     node.args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"])
         .stdin(Stdio::piped())
@@ -450,7 +450,7 @@ fn a_node_ends_with_its_standard_input_when_told_to() {
 /// OpenCV is taken down with the process; a thread that was still in it would take the process down with a signal.
 #[cfg(feature = "camera")]
 #[test]
-fn a_node_ends_well_while_its_camera_runs() {
+fn running_camera_allows_clean_exit() {
     let photos = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");
     let mut config = tempfile::NamedTempFile::new().unwrap();
     let source = format!("kind = \"images\"\npath = {photos:?}\nfps = 500\nlooping = true");
@@ -476,7 +476,7 @@ fn a_node_ends_well_while_its_camera_runs() {
 }
 
 #[test]
-fn a_vehicle_without_a_camera_is_told_that_only_programs_report() {
+fn cameraless_vehicle_expects_program_reports() {
     let mut node = ecod_node();
     node.args([
         "--role",
@@ -496,7 +496,7 @@ fn a_vehicle_without_a_camera_is_told_that_only_programs_report() {
 }
 
 #[test]
-fn a_command_of_another_program_is_told_where_it_is() {
+fn misplaced_command_names_its_program() {
     for (arguments, run) in [
         (&["demo", "--seconds", "3"][..], "`ecod-lab demo`"),
         (&["--log-format", "text", "testbed"], "`ecod-lab testbed`"),
@@ -531,7 +531,7 @@ fn a_command_of_another_program_is_told_where_it_is() {
 
 /// From nothing to a node with certificates, and what it says when they are another's.
 #[test]
-fn certificates_are_made_used_and_revoked_by_command() {
+fn certificate_commands_work() {
     let directory = tempfile::tempdir().unwrap();
     let pki = |arguments: &[&str]| {
         ecod_node()
@@ -583,7 +583,7 @@ fn certificates_are_made_used_and_revoked_by_command() {
 
 /// A node whose evidence and term an earlier version let others poison.
 #[test]
-fn evidence_and_term_are_reset_while_the_node_is_stopped() {
+fn stopped_node_resets_evidence() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);
     std::fs::write(
@@ -635,7 +635,7 @@ fn evidence_and_term_are_reset_while_the_node_is_stopped() {
 
 /// As a package installs them: the program, and beside it one without OpenCV.
 #[test]
-fn a_node_without_camera_goes_on_as_the_program_without_opencv() {
+fn cameraless_node_avoids_opencv() {
     let prefix = tempfile::tempdir().unwrap();
     let bin = prefix.path().join("bin");
     let lib = prefix.path().join("lib/ecod-node");

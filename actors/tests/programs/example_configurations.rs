@@ -19,7 +19,7 @@ fn load(name: &str) -> NodeConfig {
 }
 
 #[test]
-fn the_example_edge_aggregates_for_the_network() {
+fn example_edge_aggregates_for_network() {
     let edge = load("edge.toml");
     assert_eq!(edge.role, Role::Edge);
     assert!(edge.broker_listen().ip().is_unspecified());
@@ -28,7 +28,7 @@ fn the_example_edge_aggregates_for_the_network() {
 
 /// `doctor`, which systemd does not start, looks at the directory that the service writes.
 #[test]
-fn the_packaged_node_names_the_directory_of_its_service() {
+fn packaged_node_uses_service_directory() {
     let node = load("../../packaging/debian/node.toml");
     let unit = include_str!("../../../packaging/systemd/ecod-node.service");
     let directory = node.state_dir.expect("none is named");
@@ -46,7 +46,7 @@ fn the_packaged_node_names_the_directory_of_its_service() {
 
 #[cfg(feature = "camera")]
 #[test]
-fn the_example_vehicles_fit_the_example_edge() {
+fn example_vehicles_fit_example_edge() {
     let edge = load("edge.toml");
     for (file, role) in [("auto.toml", Role::Auto), ("cav.toml", Role::Cav)] {
         let vehicle = load(file);
@@ -95,7 +95,7 @@ fn leaves(table: &toml::Table, path: &str) -> Vec<String> {
 
 #[cfg(feature = "camera")]
 #[test]
-fn the_keys_that_most_need_are_explained_first_and_are_all_that_the_example_sets() {
+fn example_sets_only_common_keys() {
     let manual = page("docs/configuration.md");
     let first = manual.split("\n## ").nth(1).unwrap();
     let cells = first
@@ -127,7 +127,7 @@ fn the_keys_that_most_need_are_explained_first_and_are_all_that_the_example_sets
 
 #[cfg(feature = "camera")]
 #[test]
-fn configurations_in_the_documentation_can_be_used() {
+fn documented_configurations_are_valid() {
     let manual = [
         "README.md",
         "docs/configuration.md",
@@ -263,7 +263,7 @@ fn load_with(key: &str, value: &str) -> Result<NodeConfig, String> {
 
 #[cfg(feature = "camera")]
 #[test]
-fn documented_defaults_and_ranges_are_those_of_the_code() {
+fn documented_defaults_match_code() {
     let camera = load_with("cell", "\"cell\"").unwrap();
     let defaults: toml::Table = camera.to_toml().unwrap().parse().unwrap();
     let mut defaults_checked = 0;
@@ -343,7 +343,7 @@ fn documented_defaults_and_ranges_are_those_of_the_code() {
 }
 
 #[test]
-fn links_in_the_documentation_lead_somewhere() {
+fn documentation_links_resolve() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let docs = std::fs::read_dir(root.join("docs"))
         .unwrap()

@@ -64,7 +64,7 @@ fn by_key(lines: &[FusedLine]) -> BTreeMap<(String, u64, u64, bool), String> {
 
 /// Every map and verdict of every leader comes out of its log again, to the last bit, across a failover and back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_every_leader_made_is_made_again_from_its_log() {
+async fn replayed_log_reproduces_every_leader() {
     let mut cell = Cell::new(config);
     for (node, role) in [
         ("edge", Role::Edge),
@@ -127,7 +127,7 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
 
 /// An edit between two runs of a node holds for the second alone, also when both are made again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_run_is_made_again_under_its_own_configuration() {
+async fn each_run_keeps_its_configuration() {
     let mut cell = Cell::new(config);
     cell.start("edge", Role::Edge).await;
     cell.start("euclid", Role::Cav).await;
@@ -164,7 +164,7 @@ async fn every_run_is_made_again_under_its_own_configuration() {
 
 /// An observer's log has what all of the cell said, and the reports in it can be fused, also those of several runs.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_observer_records_what_all_say() {
+async fn observer_records_all_messages() {
     let mut cell = Cell::new(config);
     cell.start("edge", Role::Edge).await;
     cell.start("euclid", Role::Auto).await;

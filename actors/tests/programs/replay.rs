@@ -65,7 +65,7 @@ fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
 }
 
 #[test]
-fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
+fn equal_inputs_give_equal_bytes() {
     let folder = TempDir::new().unwrap();
     let first = replay_lot(&folder, "1.jsonl");
     let second = replay_lot(&folder, "2.jsonl");
@@ -87,7 +87,7 @@ fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
 }
 
 #[test]
-fn lines_that_cannot_be_used_are_counted_by_reason() {
+fn unusable_lines_count_by_reason() {
     let recording = fs::read(example("recordings/lot.jsonl")).unwrap();
     let first = recording.split(|byte| *byte == b'\n').next().unwrap();
     let mut input = first.to_vec();
@@ -131,7 +131,7 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
 
 /// A vote that names its location needs no position. Detections do: the field is named, and nothing used is a failure.
 #[test]
-fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_lack() {
+fn named_votes_need_no_positions() {
     let line = |topic: &str| {
         let object = r#"{"label":"cup","confidence":0.9,"landmark":"table"}"#;
         let report = format!(
@@ -163,7 +163,7 @@ fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_la
 
 /// Votes for locations that the configuration does not have, and positions in centimetres, are readable and change nothing.
 #[test]
-fn reports_of_which_none_has_an_effect_fail() {
+fn reports_without_effect_fail() {
     let folder = TempDir::new().unwrap();
     let cell = folder.path().join("cell.toml");
     fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
@@ -213,7 +213,7 @@ fn reports_of_which_none_has_an_effect_fail() {
 }
 
 #[test]
-fn input_that_is_no_recording_fails() {
+fn input_without_recording_fails() {
     let folder = TempDir::new().unwrap();
     let readme = folder.path().join("README.md");
     let empty = folder.path().join("empty.jsonl");
@@ -243,7 +243,7 @@ fn input_that_is_no_recording_fails() {
 }
 
 #[test]
-fn times_in_another_unit_are_told_of() {
+fn foreign_time_units_are_reported() {
     let line = |unit: u64| {
         let times = (0..3).map(|n| 1_732_154_400_000_000 / unit + n);
         let lines = times.map(|at| {
@@ -266,7 +266,7 @@ fn times_in_another_unit_are_told_of() {
 }
 
 #[test]
-fn passes_write_one_set_of_verdicts() {
+fn passes_write_one_verdict_set() {
     let input = example("recordings/lot.jsonl");
     let run = ecod(&[
         "replay",
@@ -293,7 +293,7 @@ fn passes_write_one_set_of_verdicts() {
 }
 
 #[test]
-fn what_cannot_be_done_is_said_and_changes_no_file() {
+fn impossible_request_changes_no_file() {
     let folder = TempDir::new().unwrap();
     let file = |name: &str, content: &str| {
         let path = folder.path().join(name);

@@ -15,7 +15,7 @@ fn docs() -> PathBuf {
 }
 
 #[test]
-fn documented_schemas_are_those_of_the_code() {
+fn documented_schemas_match_code() {
     let directory = docs().join("schemas");
     let schemas = ecod::wire::schemas();
     for (name, schema) in &schemas {
@@ -49,7 +49,7 @@ fn values<'a>(text: &'a str, before: &'a str, end: char) -> BTreeSet<&'a str> {
 
 /// `make asyncapi-check` sees to the rest of the document.
 #[test]
-fn the_asyncapi_document_has_every_topic_and_every_schema() {
+fn asyncapi_covers_topics_and_schemas() {
     let document = std::fs::read_to_string(docs().join("asyncapi.yaml")).unwrap();
     let node = NodeName::from_static("node");
     let topics = Topics::new(&NodeName::from_static("cell"));

@@ -110,7 +110,7 @@ fn free_port() -> u16 {
 /// The watchdog of a follower is fed while rounds of a live aggregator come, and of the aggregator while it leads; both
 /// say how they are, and the end is told.
 #[test]
-fn the_watchdog_is_fed_while_rounds_flow_and_only_then() {
+fn watchdog_needs_rounds() {
     let gossip = format!("127.0.0.1:{}", free_port());
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("edge.toml");
@@ -143,7 +143,7 @@ fn the_watchdog_is_fed_while_rounds_flow_and_only_then() {
 
 /// A supervisor that hangs feeds nothing, whatever the rest of the process may do.
 #[test]
-fn a_node_that_is_stopped_feeds_no_watchdog() {
+fn stopped_node_feeds_no_watchdog() {
     let edge = Service::start(&["--role", "edge", "--listen", "127.0.0.1:0"]);
     edge.hears("WATCHDOG=1");
     edge.signal(Signal::SIGSTOP);
@@ -184,7 +184,7 @@ fn log(arguments: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn logs_that_no_terminal_shows_are_json() {
+fn logs_outside_terminal_are_json() {
     for line in log(&[]) {
         let event: serde_json::Value =
             serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"));
@@ -210,7 +210,7 @@ fn logs_that_no_terminal_shows_are_json() {
 
 /// The variable is inherited by whatever a service starts; only the stream that it names is the journal.
 #[test]
-fn an_inherited_journal_stream_is_not_taken_for_the_journal() {
+fn inherited_stream_is_not_journal() {
     let mut command = program();
     command
         .args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"])
@@ -224,7 +224,7 @@ fn an_inherited_journal_stream_is_not_taken_for_the_journal() {
 }
 
 #[test]
-fn completions_and_manual_pages_know_the_commands() {
+fn completions_and_manuals_cover_commands() {
     for shell in ["bash", "zsh", "fish"] {
         let output = program().args(["completions", shell]).output().unwrap();
         let script = String::from_utf8(output.stdout).unwrap();

@@ -217,7 +217,7 @@ fn way(spans: &[(String, Span)]) -> Option<Way> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_accepts() {
+async fn spans_follow_frame_to_map() {
     let (endpoint, spans) = collector().await;
     let directory = tempfile::tempdir().unwrap();
     let directory = directory.path();
@@ -288,7 +288,7 @@ fn id(name: &str) -> [u8; 16] {
 }
 
 #[test]
-fn the_documented_id_is_that_of_its_name() {
+fn span_id_matches_documentation() {
     let id = Uuid::from_bytes(id("lot-1/euclid/1732154400123456"));
     assert_eq!(id.simple().to_string(), "c14169bfb35459ee95b084c5c2655300");
 }

@@ -92,7 +92,7 @@ fn until_status(directory: &Path, arguments: &[&str], code: i32) -> String {
 }
 
 #[test]
-fn status_tells_scripts_whether_the_node_is_ready() {
+fn status_exit_code_shows_readiness() {
     if has_installed_node() {
         return;
     }
@@ -146,7 +146,7 @@ fn status_tells_scripts_whether_the_node_is_ready() {
 }
 
 #[test]
-fn status_of_a_vehicle_without_a_leader_has_a_code_of_its_own() {
+fn leaderless_status_has_distinct_code() {
     if has_installed_node() {
         return;
     }
@@ -158,7 +158,7 @@ fn status_of_a_vehicle_without_a_leader_has_a_code_of_its_own() {
 
 /// A running node is no reason for `doctor` to complain about the node's own ports.
 #[test]
-fn doctor_recognises_the_running_node_by_its_page() {
+fn doctor_recognises_running_node() {
     if has_installed_node() {
         return;
     }
@@ -183,7 +183,7 @@ fn doctor_recognises_the_running_node_by_its_page() {
 }
 
 #[test]
-fn commands_without_flags_use_the_files_of_this_machines_node() {
+fn commands_use_local_node_files() {
     if has_installed_node() {
         return;
     }
@@ -219,7 +219,7 @@ fn commands_without_flags_use_the_files_of_this_machines_node() {
 
 /// A person at a terminal learns what runs, where the page is and what comes next, and stops the node without warnings.
 #[test]
-fn a_log_begins_with_node_page_and_next_step_and_ends_without_a_warning() {
+fn log_begins_with_page() {
     let (directory, page) = machine("edge");
     let mut node = ecod_node(directory.path());
     node.args(["--config", "ecod/node.toml", "--log-format", "text"])
@@ -261,7 +261,7 @@ fn until_status_of(page: SocketAddr, code: i32) {
 
 /// The usual port of the broker may belong to another program; a configured one must not.
 #[test]
-fn a_busy_usual_port_is_replaced_and_a_busy_configured_port_is_named_with_the_remedy() {
+fn busy_default_port_is_replaced() {
     // The port is in use, by this test or by another program.
     let _taken = TcpListener::bind("127.0.0.1:1883");
     let (directory, _) = machine("edge");

@@ -127,7 +127,7 @@ fn boxes(page: &str) -> Vec<String> {
 }
 
 #[test]
-fn photographs_of_two_cameras_become_objects_on_one_map() {
+fn two_cameras_make_one_map() {
     let directory = tempfile::tempdir().unwrap();
     let albums = ["chelsea", "astronaut"].map(|photograph| album(directory.path(), photograph));
     let saved = directory.path().join("node.toml");
@@ -204,7 +204,7 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
 }
 
 #[test]
-fn without_a_source_a_street_is_shown_by_two_cameras() {
+fn missing_source_shows_simulated_street() {
     let mut command = ecod_node();
     command
         .args(["try", "--dashboard", "127.0.0.1:0"])
@@ -252,7 +252,7 @@ fn without_a_source_a_street_is_shown_by_two_cameras() {
 }
 
 #[test]
-fn what_cannot_be_shown_is_told_in_one_line_with_a_remedy() {
+fn unusable_picture_names_remedy() {
     let directory = tempfile::tempdir().unwrap();
     let nothing = directory.path().to_str().unwrap();
     let shown = format!("{}/tests/data/photos", env!("CARGO_MANIFEST_DIR"));

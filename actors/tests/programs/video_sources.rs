@@ -67,7 +67,7 @@ fn write_clip(path: &Path, fps: f64) {
 }
 
 #[test]
-fn a_video_file_plays_once_or_again_and_again() {
+fn video_plays_once_or_looped() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("clip.avi");
     write_clip(&path, 200.0);
@@ -142,7 +142,7 @@ fn set_durations(mp4: &mut Vec<u8>, durations: &[u32]) {
 }
 
 #[test]
-fn a_video_is_shown_as_players_show_it() {
+fn video_orientation_matches_players() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("flag.mp4");
     write_flag(&path);
@@ -175,7 +175,7 @@ fn a_video_is_shown_as_players_show_it() {
 }
 
 #[test]
-fn frames_come_at_the_times_in_the_file_and_a_pause_is_no_stall() {
+fn frames_keep_file_times() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("flag.mp4");
     write_flag(&path);
@@ -213,7 +213,7 @@ fn frames_come_at_the_times_in_the_file_and_a_pause_is_no_stall() {
 }
 
 #[test]
-fn a_name_of_a_video_means_nothing_to_a_library() {
+fn special_video_names_are_literal() {
     let directory = tempfile::tempdir().unwrap();
     for name in ["50%_a:b-%04d.avi", "-i clip.avi", "http:clip.avi"] {
         let path = directory.path().join(name);
@@ -227,7 +227,7 @@ fn a_name_of_a_video_means_nothing_to_a_library() {
 }
 
 #[test]
-fn frames_are_dated_by_the_clock_of_the_node() {
+fn frames_use_node_clock() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("clip.avi");
     write_clip(&path, 10.0);
@@ -264,7 +264,7 @@ fn a_pipeline_gives_frames() {
 }
 
 #[test]
-fn a_pipeline_with_a_missing_element_names_it_and_no_secret() {
+fn missing_pipeline_element_is_named() {
     let pipeline = "nosuchsrc location=rtsp://user:hunter2@camera/1 ! appsink";
     let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'"))
         .err()
@@ -328,7 +328,7 @@ fn motion_jpeg(mut visitor: TcpStream) -> std::io::Result<()> {
 }
 
 #[test]
-fn a_network_camera_gives_frames_until_it_hangs_up() {
+fn network_camera_works_until_disconnect() {
     let url = network_camera(motion_jpeg);
     let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
     let (seen, end) = play(source.as_mut());
@@ -346,7 +346,7 @@ fn a_network_camera_gives_frames_until_it_hangs_up() {
 }
 
 #[test]
-fn a_network_camera_that_says_nothing_is_given_up_in_time() {
+fn silent_network_camera_times_out() {
     let held = std::sync::Mutex::new(Vec::new());
     let url = network_camera(move |visitor| {
         held.lock().unwrap().push(visitor);
@@ -366,7 +366,7 @@ fn a_network_camera_that_says_nothing_is_given_up_in_time() {
 }
 
 #[test]
-fn what_cannot_be_opened_is_named_with_its_reason() {
+fn unopenable_source_names_reason() {
     let directory = tempfile::tempdir().unwrap();
     let text = directory.path().join("clip.avi");
     fs::write(&text, "not a video").unwrap();
@@ -476,7 +476,7 @@ fn looping_clip() -> (tempfile::TempDir, String) {
 }
 
 #[test]
-fn a_node_whose_program_is_killed_says_so_and_goes_on_with_another() {
+fn killed_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGKILL);
@@ -490,7 +490,7 @@ fn a_node_whose_program_is_killed_says_so_and_goes_on_with_another() {
 }
 
 #[test]
-fn a_program_that_hangs_is_killed_and_replaced() {
+fn hanging_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGSTOP);
@@ -521,7 +521,7 @@ fn no_program_outlives_its_node() {
 }
 
 #[test]
-fn secrets_of_an_address_are_on_no_command_line_and_in_no_log() {
+fn address_secrets_stay_hidden() {
     let directory = tempfile::tempdir().unwrap();
     let url = network_camera(|visitor| {
         motion_jpeg(visitor.try_clone()?)?;
@@ -551,7 +551,7 @@ fn secrets_of_an_address_are_on_no_command_line_and_in_no_log() {
 }
 
 #[tokio::test]
-async fn a_capture_of_a_video_ends_with_it() {
+async fn capture_ends_with_video() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("clip.avi");
     write_clip(&path, 200.0);

@@ -39,7 +39,7 @@ fn stolen(cell: &mut Cell) -> (EmbeddedBroker, BrokerAddress) {
 }
 
 #[tokio::test]
-async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
+async fn vehicle_leaves_only_revoked_broker() {
     let mut cell = Cell::start().await;
     let (_broker, stolen) = stolen(&mut cell);
     let honest = BrokerAddress::from(cell.address);

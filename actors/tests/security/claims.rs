@@ -27,7 +27,7 @@ async fn are_denied(cell: &Cell, client: &mut Client, topics: &[&str], retain: b
 }
 
 #[tokio::test]
-async fn nobody_speaks_on_the_topics_of_another() {
+async fn foreign_topic_is_refused() {
     let mut cell = Cell::start().await;
     let mut gauss = log_in(&mut cell, "gauss", Role::Auto).await;
     let others = [
@@ -68,7 +68,7 @@ async fn one_certificate_is_one_vehicle() {
 }
 
 #[tokio::test]
-async fn a_vehicle_that_never_leads_shares_no_evidence_and_describes_no_cell() {
+async fn follower_certificate_shares_no_evidence() {
     let mut cell = Cell::start().await;
     let mut gauss = log_in(&mut cell, "gauss", Role::Cav).await;
     are_denied(&cell, &mut gauss, &["ledger/gauss", "cell"], false).await;
@@ -76,7 +76,7 @@ async fn a_vehicle_that_never_leads_shares_no_evidence_and_describes_no_cell() {
 }
 
 #[tokio::test]
-async fn a_report_is_not_kept_for_latecomers() {
+async fn report_is_not_retained() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
@@ -108,7 +108,7 @@ async fn a_report_is_not_kept_for_latecomers() {
 }
 
 #[tokio::test]
-async fn nobody_logs_in_as_another_or_leaves_its_last_will() {
+async fn login_as_other_is_refused() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let tls = client_config("gauss", &files);

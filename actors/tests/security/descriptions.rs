@@ -33,8 +33,7 @@ fn has_place(node: &NodeHandle, place: &str) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_an_operators_node_described_is_gone_when_it_is_revoked_and_the_description_before_counts()
- {
+async fn revoked_operator_loses_its_description() {
     let mut pki = Pki::new();
     let operators = [("edge", Role::Edge), ("euclid", Role::Auto)];
     let [edge, euclid] =
@@ -66,7 +65,7 @@ async fn what_an_operators_node_described_is_gone_when_it_is_revoked_and_the_des
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_candidate_that_is_no_operators_changes_no_other_nodes_description() {
+async fn candidate_changes_no_description() {
     let mut pki = Pki::new();
     let edge = pki.issue("edge", Rights::from(Role::Edge).of_operator(), DAY);
     let files = [

@@ -70,7 +70,7 @@ fn record(leader: &NodeHandle, vehicles: [(&str, bool); 2]) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
+async fn revoked_leader_loses_its_counts() {
     let mut pki = Pki::new();
     let state = tempfile::tempdir().unwrap();
     let [edge_files, gauss_files, euclid_files] = [
@@ -143,7 +143,7 @@ async fn what_a_false_leader_counted_is_gone_when_it_is_revoked() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_candidate_that_does_not_lead_changes_no_reputation_by_forged_evidence() {
+async fn forged_evidence_is_ignored() {
     let mut pki = Pki::new();
     let state = tempfile::tempdir().unwrap();
     let [edge_files, gauss_files] = [("edge", Role::Edge), ("gauss", Role::Auto)]

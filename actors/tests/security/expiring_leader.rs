@@ -40,7 +40,7 @@ async fn longest_gap_until(leader: &str, node: &NodeHandle) -> Duration {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_leader_hands_over_before_its_certificate_ends_and_leads_again_with_a_new_one() {
+async fn expiring_leader_hands_over() {
     let mut pki = Pki::new();
     let files = pki.issue_three();
     let nodes = start_cell(files).await;
@@ -66,7 +66,7 @@ fn ending(node: &NodeHandle) -> Option<String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_node_names_the_end_of_its_own_certificate_and_a_far_end_moves_no_lead() {
+async fn distant_expiry_moves_no_lead() {
     let mut pki = Pki::new();
     // Issued long ago, each with a part of its validity left.
     let mut issue = |node: &str, role, days: u32, age_days: u32| {
@@ -106,7 +106,7 @@ async fn every_node_names_the_end_of_its_own_certificate_and_a_far_end_moves_no_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn prometheus_reads_how_long_the_certificate_is_valid() {
+async fn prometheus_shows_certificate_validity() {
     let mut pki = Pki::new();
     let files = pki.issue("edge", Role::Edge, DAY);
     let edge = start_with("edge", Role::Edge, files, None, |config| {

@@ -82,7 +82,7 @@ fn unproven(counters: &Counters) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn rounds_in_the_leaders_name_at_the_standbys_broker_are_not_taken() {
+async fn forged_standby_rounds_are_refused() {
     let mut pki = Pki::new();
     let files = [
         ("edge", Role::Edge),

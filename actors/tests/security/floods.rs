@@ -27,7 +27,7 @@ async fn closed(stream: &mut (impl AsyncReadExt + Unpin)) {
 }
 
 #[tokio::test]
-async fn who_knocks_too_often_is_not_heard_and_others_are() {
+async fn connection_flood_blocks_no_client() {
     let mut cell = Cell::start().await;
     for _ in 0..300 {
         drop(knock(cell.address).await);
@@ -43,7 +43,7 @@ async fn who_knocks_too_often_is_not_heard_and_others_are() {
 
 /// A flood from the address of an honest node, such as from behind the same address translation.
 #[tokio::test]
-async fn a_node_comes_back_while_its_own_address_floods() {
+async fn node_reconnects_during_flood() {
     let adjust = |config: &mut BrokerConfig| {
         config.connects_per_s = 20;
         config.handshake_timeout_ms = 5000;
@@ -76,7 +76,7 @@ async fn a_node_comes_back_while_its_own_address_floods() {
 }
 
 #[tokio::test]
-async fn who_takes_its_time_to_log_in_loses_its_place() {
+async fn slow_login_loses_its_place() {
     let mut cell = Cell::start_with(|config| config.handshake_timeout_ms = 700).await;
     let mut silent = Vec::new();
     for _ in 0..20 {
@@ -98,7 +98,7 @@ async fn who_takes_its_time_to_log_in_loses_its_place() {
 }
 
 #[tokio::test]
-async fn what_is_no_mqtt_ends_its_own_connection_only() {
+async fn foreign_protocol_ends_its_connection() {
     let mut cell = Cell::start().await;
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     let login = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 4, 2, 0, 60, 0, 0];
@@ -126,7 +126,7 @@ async fn what_is_no_mqtt_ends_its_own_connection_only() {
 }
 
 #[tokio::test]
-async fn who_only_looks_whether_a_broker_is_there_is_not_counted_as_kept_out() {
+async fn port_probe_is_not_counted() {
     let mut cell = Cell::start().await;
     for _ in 0..3 {
         let mut stream = knock(cell.address).await;
@@ -140,7 +140,7 @@ async fn who_only_looks_whether_a_broker_is_there_is_not_counted_as_kept_out() {
 }
 
 #[tokio::test]
-async fn a_packet_that_is_too_large_ends_its_own_connection_only() {
+async fn oversized_packet_ends_its_connection() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
@@ -151,7 +151,7 @@ async fn a_packet_that_is_too_large_ends_its_own_connection_only() {
 }
 
 #[tokio::test]
-async fn a_report_as_large_as_a_map_is_refused() {
+async fn map_sized_report_is_refused() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
@@ -166,7 +166,7 @@ async fn a_report_as_large_as_a_map_is_refused() {
 }
 
 #[tokio::test]
-async fn one_certificate_does_not_take_the_places_of_others() {
+async fn certificate_takes_no_foreign_places() {
     let mut cell = Cell::start().await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let tls = client_config("gauss", &files);
@@ -201,7 +201,7 @@ async fn one_certificate_does_not_take_the_places_of_others() {
 
 /// The broker of a node that nobody configured: for this machine only, without certificates.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn limits_hold_on_loopback_as_they_come() {
+async fn limits_hold_on_default_loopback() {
     let mut config = NodeConfig {
         name: Some(node("edge")),
         role: Role::Edge,

@@ -51,7 +51,7 @@ async fn repeat(towards: SocketAddr, relay: UdpSocket) {
 }
 
 #[tokio::test]
-async fn a_repeated_frame_is_taken_once_and_counted() {
+async fn repeated_frame_is_accepted_once() {
     let relay = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     let between = relay.local_addr().unwrap();
     let edge = start("edge", None).await;

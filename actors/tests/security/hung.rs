@@ -14,7 +14,7 @@ use tokio::time::{sleep, timeout};
 use crate::fixture::{Client, DAY, Pki, SOON, client_config, node};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
+async fn hanging_broker_is_declared_dead() {
     let mut pki = Pki::new();
     let files = pki.issue("edge", Role::Edge, DAY);
     let (release, held) = mpsc::channel::<()>();

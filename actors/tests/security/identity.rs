@@ -40,7 +40,7 @@ fn seen_by(node: &Member) -> Vec<(String, Role)> {
 
 /// All declare to be an edge; what others see is what their certificates allow.
 #[tokio::test]
-async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_nobody() {
+async fn nodes_meet_only_with_certificates() {
     let mut pki = Pki::new();
     let [edge, euclid] = [
         pki.issue("edge", Role::Edge, DAY),
@@ -81,7 +81,7 @@ async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_no
 }
 
 #[tokio::test]
-async fn a_revoked_node_is_down_soon_after_the_list_is_written() {
+async fn revoked_node_goes_down_soon() {
     let mut pki = Pki::new();
     let [edge, euclid] = [
         pki.issue("edge", Role::Edge, DAY),

@@ -29,7 +29,7 @@ async fn full_edge(pki: &mut Pki) -> NodeHandle {
 }
 
 #[tokio::test]
-async fn followers_of_a_leader_that_lets_nobody_in_go_on_to_the_next() {
+async fn followers_skip_leader_refusing_logins() {
     let mut pki = Pki::new();
     let edge = full_edge(&mut pki).await;
     let euclid = pki.issue("euclid", Role::Auto, DAY);
@@ -79,8 +79,7 @@ impl Write for Log {
 
 /// Sessions of the membership go on by the former certificate. New connections meet the other one.
 #[tokio::test]
-async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next()
- {
+async fn followers_skip_distrusted_leader() {
     let mut pki = Pki::new();
     let mut elsewhere = Pki::new();
     let files = pki.issue_three();
@@ -133,7 +132,7 @@ async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_an
 
 /// Its own files are in order, so that it starts, and leads where it is alone.
 #[tokio::test]
-async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_nothing() {
+async fn foreign_edge_disturbs_no_cell() {
     let mut pki = Pki::new();
     let mut elsewhere = Pki::new();
     let files = pki.issue_three();
@@ -175,7 +174,7 @@ async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_
 }
 
 #[tokio::test]
-async fn a_leader_that_lets_nobody_in_says_so_where_nobody_else_can_lead() {
+async fn sole_leader_reports_refused_logins() {
     let mut pki = Pki::new();
     let edge = full_edge(&mut pki).await;
     let gauss = pki.issue("gauss", Role::Cav, DAY);

@@ -47,7 +47,7 @@ async fn takes_a_map(node: &NodeHandle) {
 }
 
 #[tokio::test]
-async fn unsigned_and_replanted_payloads_are_counted_and_the_signed_go_on() {
+async fn unsigned_payloads_are_counted() {
     let mut shared = EmbeddedBroker::new(BrokerConfig::default());
     let broker = shared
         .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))

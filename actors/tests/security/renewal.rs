@@ -78,7 +78,7 @@ fn ending(node: &NodeHandle) -> Option<String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_renews_its_certificates_where_the_ca_is_and_shows_no_trouble() {
+async fn cell_renews_certificates_at_ca() {
     let mut machines = Machines::new();
     let files = NODES.map(|(node, role)| machines.files(node, role, 65));
     let keys = files
@@ -104,7 +104,7 @@ async fn a_cell_renews_its_certificates_where_the_ca_is_and_shows_no_trouble() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_revoked_certificate_is_not_renewed_and_its_node_says_why() {
+async fn revoked_certificate_is_not_renewed() {
     let mut machines = Machines::new();
     let edge_files = machines.files("edge", Role::Edge, 0);
     let files = machines.files("gauss", Role::Cav, 65);
@@ -127,7 +127,7 @@ async fn a_revoked_certificate_is_not_renewed_and_its_node_says_why() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn every_node_warns_of_the_end_of_the_cells_ca() {
+async fn expiring_ca_warns_every_node() {
     let directory = tempfile::tempdir().unwrap();
     let long_ago = clock::now() - 3300 * DAY;
     let mut authority = Authority::init(directory.path(), &name("lot"), long_ago).unwrap();

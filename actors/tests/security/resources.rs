@@ -152,7 +152,7 @@ impl Honest {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn readers_that_do_not_read_lose_their_own_messages_only() {
+async fn slow_readers_lose_only_theirs() {
     let mut cell = Cell::start_with(|config| config.max_clients_each = 32).await;
     let mut readers = Vec::new();
     for _ in 0..30 {
@@ -184,7 +184,7 @@ async fn readers_that_do_not_read_lose_their_own_messages_only() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_certificate_sends_no_more_than_its_share_and_others_do_not_wait() {
+async fn certificate_sends_only_its_share() {
     const TIME: Duration = Duration::from_secs(6);
     let mut cell = Cell::start_with(|config| config.max_clients_each = 32).await;
     let mut honest = Honest::start(&mut cell).await;
@@ -223,7 +223,7 @@ async fn one_certificate_sends_no_more_than_its_share_and_others_do_not_wait() {
 }
 
 #[tokio::test]
-async fn subscriptions_of_all_clients_of_one_certificate_count_together() {
+async fn subscriptions_of_certificate_count_together() {
     let mut cell = Cell::start().await;
     let mut first = log_in(&mut cell, "gauss", Role::Cav, CLEAN).await;
     for n in 0..200 {
@@ -252,7 +252,7 @@ async fn subscriptions_of_all_clients_of_one_certificate_count_together() {
 
 /// Messages are granted without acknowledgement only, and sessions end with their connections: nothing is kept for later.
 #[tokio::test]
-async fn nothing_is_kept_for_who_is_absent_or_does_not_acknowledge() {
+async fn absent_readers_have_no_queue() {
     let mut cell = Cell::start().await;
     let mut honest = Honest::start(&mut cell).await;
     let files = cell.pki.issue("gauss", Role::Cav, DAY);
@@ -360,7 +360,7 @@ async fn large_maps_reach_all_readers() {
 
 /// A broker for its own machine, where nothing tells clients apart.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn readers_without_certificates_that_do_not_read_lose_their_own_messages_only() {
+async fn uncertified_slow_readers_lose_theirs() {
     let counters = Arc::<Counters>::default();
     let policy = AccessPolicy {
         credentials: None,

@@ -47,7 +47,7 @@ async fn report_until_shown(client: &mut Client, vehicle: &NodeName, edge: &Node
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_revoked_client_reported_leaves_the_map_whether_it_is_connected_or_has_left() {
+async fn revoked_clients_objects_are_removed() {
     let mut pki = Pki::new();
     let edge_files = pki.issue("edge", Role::Edge, DAY);
     let edge = start_with("edge", Role::Edge, edge_files, None, |config| {

@@ -63,7 +63,7 @@ fn too_deep(levels: usize) -> String {
 }
 
 #[tokio::test]
-async fn topics_and_filters_beyond_measure_are_refused() {
+async fn oversized_topics_are_refused() {
     let mut cell = Cell::start().await;
     for topic in [too_deep(15_000), too_deep(40), "a".repeat(60_000)] {
         let mut stream = secure(&mut cell).await;
@@ -109,7 +109,7 @@ async fn subscriptions_without_number_are_refused() {
 }
 
 #[tokio::test]
-async fn a_packet_of_too_many_filters_ends_its_connection() {
+async fn packet_with_many_filters_refused() {
     let mut cell = Cell::start_with(|config| config.max_packet_bytes = Some(1 << 20)).await;
     let mut stream = secure(&mut cell).await;
     ask(&mut stream, &login(None), &CONNACK).await;
@@ -129,7 +129,7 @@ async fn a_packet_of_too_many_filters_ends_its_connection() {
 
 /// The broker without a guard has no one to ask, and must survive all the same.
 #[tokio::test]
-async fn a_broker_without_a_guard_survives_endless_topics() {
+async fn unguarded_broker_survives_endless_topics() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = broker
         .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))

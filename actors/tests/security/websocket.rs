@@ -42,7 +42,7 @@ async fn log_in(cell: &mut Cell, id: &str) -> (WebSocketStream<TlsStream<TcpStre
 }
 
 #[tokio::test]
-async fn a_websocket_has_the_rights_of_its_certificate_and_no_place_more() {
+async fn websocket_has_rights_of_certificate() {
     let mut cell = Cell::start().await;
     let run = |number: usize| format!("{number:032x}");
     let (_, answer) = log_in(&mut cell, &format!("euclid-{}", run(0))).await;
@@ -60,7 +60,7 @@ async fn a_websocket_has_the_rights_of_its_certificate_and_no_place_more() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn frames_without_content_count_as_what_they_take() {
+async fn empty_frames_count_their_size() {
     // First the burst is used up, and what the sockets hold.
     const BEGIN: Duration = Duration::from_secs(5);
     const END: Duration = Duration::from_secs(9);

@@ -316,7 +316,7 @@ fn passes(trial: &Trial) {
 }
 
 #[test]
-fn a_vehicle_from_1970_and_a_leader_that_steps_take_part() {
+fn nodes_with_wrong_clocks_participate() {
     for trial in TRIALS.iter().filter(|trial| {
         [
             "vehicle in 1970, then set",
@@ -331,7 +331,7 @@ fn a_vehicle_from_1970_and_a_leader_that_steps_take_part() {
 /// Nobody believes its certificate, nor does it believe others': it says so and waits, and takes part as soon as its clock
 /// is set.
 #[test]
-fn a_node_with_a_certificate_waits_for_its_clock_and_says_so() {
+fn certified_node_waits_for_clock() {
     for late in ["noether", "edge"] {
         let mut cell = Cell::with_certificates();
         for name in ["euclid", "gauss"] {

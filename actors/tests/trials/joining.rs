@@ -121,7 +121,7 @@ pub(crate) fn until(what: &str, holds: impl Fn() -> bool) {
 }
 
 #[test]
-fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
+fn three_machines_form_cell() {
     let machines = ["edge", "gauss", "euclid"].map(|_| tempfile::tempdir().unwrap());
     let [edge, gauss, euclid] = machines
         .each_ref()
@@ -203,7 +203,7 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
 }
 
 #[test]
-fn a_node_that_joins_a_cell_of_a_city_takes_the_citys_vehicles() {
+fn city_cell_accepts_city_vehicles() {
     let machines = ["city", "edge", "gauss"].map(|_| tempfile::tempdir().unwrap());
     let [city, edge, gauss] = machines
         .each_ref()
@@ -256,7 +256,7 @@ fn a_node_that_joins_a_cell_of_a_city_takes_the_citys_vehicles() {
 }
 
 #[test]
-fn init_and_invite_say_why_they_refuse() {
+fn init_and_invite_explain_refusal() {
     let machine = tempfile::tempdir().unwrap();
     let missing = fails(&["invite", "gauss", "--dir", machine.path().to_str().unwrap()]);
     assert!(
@@ -299,7 +299,7 @@ fn let_end(pki: &Path, node: &str, role: Role, machine: &Path) {
 }
 
 #[test]
-fn after_the_end_of_its_certificate_each_node_comes_back_by_one_command() {
+fn one_command_restores_expired_node() {
     let machines = ["edge", "gauss"].map(|_| tempfile::tempdir().unwrap());
     let [edge, gauss] = machines
         .each_ref()

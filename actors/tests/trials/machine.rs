@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn the_part_that_is_withheld_counts_by_half_seconds() {
+    fn withheld_share_uses_half_seconds() {
         let all = std::thread::available_parallelism().unwrap().get() as u64;
         let part = |readings: &[(u64, u64)]| {
             (100.0
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_machine_that_stands_still_wakes_nobody_in_time() {
+    async fn standing_machine_counts_as_starved() {
         let mut machine = Machine::default();
         let (watch, _) = tokio::join!(machine.sleep(3 * PERIOD), async {
             std::thread::sleep(PERIOD + 2 * LONGEST_DELAY);
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn the_kernel_says_how_much_it_is() {
+    fn kernel_reports_stolen_time() {
         let stat = "cpu  4369460 138814 225846 1134129 11171 0 7106 391122 0 0\ncpu0 1 2 3 4 5 6 7 8 9 10\n";
         assert_eq!(stolen(stat), Some(Duration::from_millis(3_911_220)));
         assert_eq!(stolen("cpu  1 2 3 4\n"), None);

@@ -41,7 +41,7 @@ fn longest_gap(cell: &Cell, node: &str, since: Timestamp) -> Duration {
 /// Each node of a cell of three is renewed twice, and all live past the end of their first two certificates.
 #[test]
 #[ignore = "takes six minutes: make renewal"]
-fn every_node_is_renewed_twice_without_a_missed_map() {
+fn every_node_is_renewed_twice() {
     let mut cell = Cell::with_renewals(VALID);
     for node in NODES {
         cell.start(node, Fake::Off);

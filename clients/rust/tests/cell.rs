@@ -119,7 +119,7 @@ fn agreed(cell: &Cell, node: &str) -> std::sync::Arc<GlobalMap> {
 }
 
 #[test]
-fn a_node_takes_reports_and_its_messages_are_read() {
+fn client_reports_and_reads_messages() {
     for encoding in [Encoding::Json, Encoding::Compact] {
         let mut config = config("edge", Role::Edge);
         config.mqtt.encoding = encoding;
@@ -185,7 +185,7 @@ fn image(boxes: Vec<PixelBox>) -> BoxFrame {
 }
 
 #[test]
-fn a_node_places_boxes_on_the_map() {
+fn boxes_are_placed_on_map() {
     let node = Node::start(config("edge", Role::Edge));
     let cell = Cell::connect(node.settings("euclid")).unwrap();
     let began = Instant::now();
@@ -216,7 +216,7 @@ fn tls_of(authority: &mut Authority, name: &'static str, role: Role) -> (TlsConf
 }
 
 #[test]
-fn with_certificates_a_program_speaks_for_its_node_alone() {
+fn certified_program_serves_one_node() {
     let directory = tempfile::tempdir().unwrap();
     let mut authority = Authority::init(
         directory.path(),
@@ -325,7 +325,7 @@ fn with_certificates_a_program_speaks_for_its_node_alone() {
 }
 
 #[test]
-fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
+fn map_position_converts_by_origin() {
     let node = Node::start(config("edge", Role::Edge));
     let cell = Cell::connect(node.settings("edge")).unwrap();
     assert_eq!(
@@ -370,7 +370,7 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
 }
 
 #[test]
-fn a_cell_without_a_usable_description_says_so() {
+fn unusable_description_is_error() {
     let (_broker, address) = broker();
     let patient = settings(&address.to_string(), "euclid");
     let cell = Cell::connect(Settings {
@@ -423,7 +423,7 @@ fn a_cell_without_a_usable_description_says_so() {
 }
 
 #[test]
-fn what_the_door_refuses_the_program_learns() {
+fn refusal_reaches_program() {
     let node = Node::start(config("euclid", Role::Cav));
     let cell = Cell::connect(node.settings("gauss")).unwrap();
     let began = Instant::now();
@@ -484,7 +484,7 @@ const DESCRIPTION: &str = "ecod/v1/lot-1/cell";
 const MAPS: &str = "ecod/v1/lot-1/global_detections";
 
 #[test]
-fn only_later_rounds_are_given_and_the_newest_first() {
+fn only_newest_rounds_are_given() {
     let (_broker, address) = broker();
     let speaker = speaker(address);
     let cell = Cell::connect(settings(&address.to_string(), "euclid")).unwrap();
@@ -521,7 +521,7 @@ fn only_later_rounds_are_given_and_the_newest_first() {
 }
 
 #[test]
-fn a_lost_broker_is_found_again() {
+fn lost_broker_is_reconnected() {
     let (mut broker, address) = broker();
     let cell = Cell::connect(settings(&address.to_string(), "euclid")).unwrap();
     let mut maps = cell.maps().timeout(SOON);
@@ -552,7 +552,7 @@ fn a_lost_broker_is_found_again() {
 }
 
 #[test]
-fn what_no_cell_would_take_is_not_sent() {
+fn invalid_report_is_not_sent() {
     let (_broker, address) = broker();
     let cell = Cell::connect(settings(&address.to_string(), "euclid")).unwrap();
     let said = |outcome: Result<bool, Error>| outcome.unwrap_err().to_string();
@@ -622,7 +622,7 @@ fn what_no_cell_would_take_is_not_sent() {
 }
 
 #[test]
-fn nobody_at_the_address_is_said_at_once() {
+fn unreachable_address_fails_at_once() {
     let (mut broker, address) = broker();
     broker.stop();
     let began = Instant::now();
@@ -657,7 +657,7 @@ fn is_shown(page: &str, example: &str) -> bool {
 }
 
 #[test]
-fn the_documented_programs_do_what_they_say() {
+fn documented_programs_work() {
     for (page, name) in [
         ("README.md", "maps_and_reports"),
         ("README.md", "report_frames"),
@@ -706,7 +706,7 @@ fn the_documented_programs_do_what_they_say() {
 }
 
 #[test]
-fn the_planner_goes_brakes_for_what_is_ahead_and_brakes_without_maps() {
+fn planner_brakes_for_obstacle_or_silence() {
     let mut config = config("edge", Role::Edge);
     config.landmarks.clear();
     let node = Node::start(config);

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_object_is_the_cells_own_while_a_vehicle_of_it_detects_it() {
+    fn object_is_local_while_detected() {
         let report = |node: &'static str, x_m: f64| ObjectReport {
             objects: vec![PerceivedObject::new("car", 0.9, x_m, 0.0)],
             ..ObjectReport::new(

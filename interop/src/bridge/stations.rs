@@ -120,7 +120,7 @@ mod tests {
     const HONEST: NodeName = NodeName::from_static("honest");
 
     #[test]
-    fn a_receiver_with_many_stations_leaves_another_its_share() {
+    fn receiver_leaves_share_for_others() {
         let mut places = StationPlaces::default();
         let start = Instant::now();
         for number in 0..12 {
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_is_of_the_receiver_that_brings_it() {
+    fn station_belongs_to_its_receiver() {
         let mut places = StationPlaces::default();
         let start = Instant::now();
         places.enter(7, &HONEST, start).unwrap();
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_that_keeps_to_its_share_loses_nothing_by_uneven_times() {
+    fn uneven_times_keep_station_share() {
         let start = Instant::now();
         let taken = |period_ms: u64, others: u32, of: &NodeName| {
             let mut places = StationPlaces::default();

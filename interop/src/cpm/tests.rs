@@ -154,7 +154,7 @@ fn extreme_object() -> impl Strategy<Value = FusedObject> {
 
 proptest! {
     #[test]
-    fn extreme_objects_of_one_vehicle_cost_the_message_no_others(
+    fn extreme_objects_drop_no_others(
         extreme in proptest::collection::vec(extreme_detection(), 0..4),
         rotation_deg in -180.0..180.0,
     ) {
@@ -171,7 +171,7 @@ proptest! {
     }
 
     #[test]
-    fn extreme_objects_and_places_cost_the_message_of_a_map_no_others(
+    fn extreme_positions_drop_no_others(
         extreme in proptest::collection::vec(extreme_object(), 0..6),
         places in proptest::collection::vec((up_to(1e8), up_to(1e8), 0.0..=1.0), 0..4),
         rotation_deg in -180.0..180.0,
@@ -205,7 +205,7 @@ proptest! {
     }
 
     #[test]
-    fn a_report_of_any_pose_is_encoded_or_refused(
+    fn any_pose_is_encoded_or_refused(
         (x_m, y_m) in (up_to(1e8), up_to(1e8)),
         heading_rad in -TAU..=TAU,
         objects in proptest::collection::vec(extreme_detection(), 0..4),
@@ -220,7 +220,7 @@ proptest! {
     }
 
     #[test]
-    fn a_report_comes_back_within_the_resolution_of_the_standard(
+    fn report_round_trips_within_resolution(
         objects in proptest::collection::vec(detection(), 0..40),
         pose in proptest::option::of((-400.0..400.0, -400.0..400.0, -PI..PI)),
         rotation_deg in -180.0..180.0,
@@ -264,7 +264,7 @@ proptest! {
     }
 
     #[test]
-    fn hostile_bytes_are_refused_or_become_a_valid_report(
+    fn hostile_bytes_give_no_invalid_report(
         mut tail in proptest::collection::vec(any::<u8>(), 0..400),
         flips in proptest::collection::vec((0usize..200, any::<u8>()), 0..6),
     ) {
@@ -285,7 +285,7 @@ proptest! {
 }
 
 #[test]
-fn an_object_keeps_its_number_and_two_never_share_one() {
+fn object_numbers_stay_unique() {
     let mut ids = ObjectIds::default();
     // The first two bytes of all are equal.
     let all: Vec<_> = (1..=3).map(Uuid::from_u128).collect();
@@ -306,7 +306,7 @@ fn an_object_keeps_its_number_and_two_never_share_one() {
 }
 
 #[test]
-fn a_node_has_the_same_station_number_in_every_run() {
+fn station_number_survives_runs() {
     let numbers = || StationIds::new(NodeName::from_static("lot-1"));
     let euclid = NodeName::from_static("euclid");
     let gauss = NodeName::from_static("gauss");
@@ -320,7 +320,7 @@ fn a_node_has_the_same_station_number_in_every_run() {
 }
 
 #[test]
-fn a_map_has_its_objects_and_the_road_users_at_known_locations() {
+fn map_includes_landmark_road_users() {
     let at = |id: &str, label: Option<&str>| LandmarkState {
         id: id.into(),
         label: label.map(Into::into),
@@ -353,7 +353,7 @@ fn a_map_has_its_objects_and_the_road_users_at_known_locations() {
 }
 
 #[test]
-fn of_too_many_objects_the_surest_are_sent() {
+fn surest_objects_fit_first() {
     let objects = (0..300_u16).map(|number| FusedObject {
         confidence: f64::from(number) / 300.0,
         ..fused(number.into(), 1.0)
@@ -377,7 +377,7 @@ fn of_too_many_objects_the_surest_are_sent() {
 }
 
 #[test]
-fn the_reference_position_is_where_most_objects_are() {
+fn reference_position_fits_most_objects() {
     let sent = |places: &[f64]| {
         let objects = (1..).zip(places).map(|(id, x_m)| fused(id, *x_m)).collect();
         let message = encode_map(
@@ -417,7 +417,7 @@ fn the_reference_position_is_where_most_objects_are() {
 }
 
 #[test]
-fn messages_that_are_not_for_here_are_refused_by_reason() {
+fn unsuitable_messages_name_refusal_reason() {
     let message = encode_report(&report(Vec::new()), &cell(0.0), 1)
         .unwrap()
         .bytes;
@@ -455,7 +455,7 @@ fn messages_that_are_not_for_here_are_refused_by_reason() {
 }
 
 #[test]
-fn a_covariance_turns_with_the_frames() {
+fn covariance_rotates_with_frame() {
     // The cell's x axis points north.
     let quarter = origin(90.0);
     let object = PerceivedObject {
@@ -499,7 +499,7 @@ fn written(object: PerceivedObject) -> cdd::PerceivedObject {
 }
 
 #[test]
-fn values_beyond_the_range_are_written_as_the_codes_that_say_so() {
+fn excess_values_become_codes() {
     let car = PerceivedObject::new("car", 0.9, 4.0, 5.0);
     let wide = written(PerceivedObject {
         covariance_m2: Some([20.9 * 20.9, 0.0, 1e5]),
@@ -541,7 +541,7 @@ fn values_beyond_the_range_are_written_as_the_codes_that_say_so() {
 }
 
 #[test]
-fn without_a_heading_no_box_is_stated() {
+fn no_heading_gives_no_box() {
     let car = PerceivedObject {
         size_m: Some([4.5, 1.8]),
         ..PerceivedObject::new("car", 0.9, 4.0, 5.0)
@@ -560,7 +560,7 @@ fn without_a_heading_no_box_is_stated() {
 }
 
 #[test]
-fn labels_of_one_class_add_up() {
+fn labels_of_one_class_sum() {
     let scores = [
         ("car".into(), 0.4),
         ("dog".into(), 0.25),
@@ -583,7 +583,7 @@ fn labels_of_one_class_add_up() {
 }
 
 #[test]
-fn an_object_that_is_no_longer_seen_is_dated_and_placed_as_it_was_last_seen() {
+fn unseen_object_keeps_last_position() {
     let coasting = |age_s| FusedObject {
         age_s: Some(age_s),
         velocity_mps: Some([10.0, 0.0]),
@@ -612,7 +612,7 @@ fn an_object_that_is_no_longer_seen_is_dated_and_placed_as_it_was_last_seen() {
 }
 
 #[test]
-fn objects_that_the_cell_does_not_know_by_itself_are_not_sent() {
+fn foreign_objects_are_omitted() {
     let map = map(vec![fused(1, 10.0), fused(2, 20.0)], Vec::new());
     let message = encode_map(
         &map,
@@ -665,7 +665,7 @@ fn vacancy_signs_are_no_objects() {
 }
 
 #[test]
-fn parts_that_report_received_messages_are_told_from_others() {
+fn receiver_parts_are_recognised() {
     let is_received = |name: &'static str| is_received(&NodeName::from_static(name));
     assert!(is_received("edge--cpm-4711"));
     assert!(
@@ -682,7 +682,7 @@ fn parts_that_report_received_messages_are_told_from_others() {
 }
 
 #[test]
-fn there_are_station_numbers_for_so_many_names_that_are_heard() {
+fn station_numbers_are_bounded() {
     let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
     let start = Instant::now();
     let name = |index: u32| NodeName::new(format!("node-{index}")).unwrap();
@@ -705,7 +705,7 @@ fn there_are_station_numbers_for_so_many_names_that_are_heard() {
 }
 
 #[test]
-fn a_vehicle_that_invents_parts_takes_no_others_numbers() {
+fn invented_parts_take_no_numbers() {
     let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
     let now = Instant::now();
     let part = |index: u32| NodeName::new(format!("evil--{index}")).unwrap();

@@ -153,7 +153,7 @@ fn foreign_cpm(at: Timestamp, station: u32) -> Vec<u8> {
 }
 
 #[test]
-fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
+fn cpm_and_map_cross_bridge() {
     let edge = Edge::start(None);
     let (bridge, thread) = edge.bridge();
     let (client, mut connection) = edge.stranger("roadside");
@@ -282,7 +282,7 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
 }
 
 #[test]
-fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
+fn station_places_are_limited() {
     let edge = Edge::start(None);
     let (bridge, thread) = edge.bridge();
     let radio = Cell::connect(edge.settings.clone()).unwrap();
@@ -315,7 +315,7 @@ fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
 }
 
 #[test]
-fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
+fn namesakes_reports_stay_off_map_topic() {
     let edge = Edge::start(None);
     let (bridge, thread) = edge.bridge();
     let (client, mut connection) = edge.stranger("roadside");
@@ -370,7 +370,7 @@ fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
 }
 
 #[test]
-fn without_an_origin_the_bridge_says_how_to_set_one() {
+fn missing_origin_names_remedy() {
     let edge = Edge::start(None);
     let error = CpmBridge::connect(edge.settings.clone()).err().unwrap();
     assert!(
@@ -380,7 +380,7 @@ fn without_an_origin_the_bridge_says_how_to_set_one() {
 }
 
 #[test]
-fn with_certificates_a_program_of_the_node_publishes_cpms() {
+fn certified_program_publishes_cpms() {
     let directory = tempfile::tempdir().unwrap();
     let time = Timestamp::default() + std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap();
     let mut authority =

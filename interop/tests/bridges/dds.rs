@@ -107,7 +107,7 @@ fn camera() -> RosCamera {
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
-fn detections_in_the_map_become_objects_there() {
+fn map_frame_detections_become_objects() {
     let input = DetectorTopics::InSpace("/detections".to_owned());
     exchange(
         "map",
@@ -121,7 +121,7 @@ fn detections_in_the_map_become_objects_there() {
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
-fn detections_before_a_camera_are_placed_by_its_pose() {
+fn camera_detections_use_pose() {
     let input = DetectorTopics::InSpace("detections".to_owned());
     let ros = RosSettings {
         input: Some(input),
@@ -133,7 +133,7 @@ fn detections_before_a_camera_are_placed_by_its_pose() {
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
-fn detections_before_a_camera_that_moves_are_placed_by_its_poses() {
+fn moving_camera_detections_use_poses() {
     let input = Some(DetectorTopics::InSpace("/detections".to_owned()));
     let camera = RosCamera {
         pose: None,
@@ -150,7 +150,7 @@ fn detections_before_a_camera_that_moves_are_placed_by_its_poses() {
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
-fn boxes_in_pictures_are_placed_by_the_optics_and_the_ground() {
+fn image_boxes_use_optics_and_ground() {
     let input = DetectorTopics::InPictures("/detections".to_owned(), "/camera_info".to_owned());
     let ros = RosSettings {
         input: Some(input),
@@ -161,7 +161,7 @@ fn boxes_in_pictures_are_placed_by_the_optics_and_the_ground() {
 }
 
 #[test]
-fn topics_of_the_bridge_itself_are_no_detectors() {
+fn bridge_topics_are_no_detectors() {
     let optics = || "/camera_info".to_owned();
     let inputs = [
         (

@@ -72,7 +72,7 @@ fn log(directory: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn a_log_has_detections_markers_and_poses_for_ros() {
+fn log_converts_to_ros_messages() {
     let directory = tempfile::tempdir().unwrap();
     let log = log(directory.path());
     let mut bytes = Vec::new();
@@ -175,7 +175,7 @@ fn camera_log() -> Vec<u8> {
 }
 
 #[test]
-fn a_picture_of_the_camera_is_the_same_picture_and_has_its_optics() {
+fn picture_keeps_bytes_and_optics() {
     let mut bytes = Vec::new();
     let done = convert(&camera_log(), Cursor::new(&mut bytes)).unwrap();
     assert_eq!((done.written, done.unusable), (2, 1));
@@ -212,7 +212,7 @@ fn a_picture_of_the_camera_is_the_same_picture_and_has_its_optics() {
 }
 
 #[test]
-fn what_is_no_log_leaves_no_output_in_the_way_of_the_next_try() {
+fn invalid_log_leaves_no_output() {
     let directory = tempfile::tempdir().unwrap();
     let log = directory.path().join("log.mcap");
     let output = directory.path().join("ros2.mcap");
@@ -247,7 +247,7 @@ fn what_is_no_log_leaves_no_output_in_the_way_of_the_next_try() {
 
 #[test]
 #[ignore = "needs Python packages, which `make ros2-check` installs"]
-fn readers_of_ros_read_it_and_write_the_same_bytes() {
+fn ros_readers_write_equal_bytes() {
     let python = std::env::var("ROS2_PYTHON").unwrap();
     let directory = tempfile::tempdir().unwrap();
     let outputs = ["node.mcap", "camera.mcap"].map(|name| directory.path().join(name));

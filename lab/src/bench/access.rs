@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_whose_certificates_speak_for_one_vehicle_each_is_refused_in_words() {
+    fn single_vehicle_certificates_are_refused() {
         let mut config = NodeConfig {
             tls: Some(ecod_actors::transport::pki::TlsConfig {
                 ca: "ca.pem".into(),
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_signed_is_read_without_its_signature() {
+    fn signature_is_skipped_on_read() {
         let mut config = NodeConfig {
             membership: MembershipConfig {
                 key: Some(Secret::new("correct horse battery")),

@@ -414,7 +414,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn delays_by_a_clock_that_is_ahead_are_no_figures() {
+    fn fast_clock_delays_are_discarded() {
         let mut micros = vec![350; 99];
         micros.push(-1);
         assert!(delays(&micros).unwrap().quantiles().p50_us > 349.0);
@@ -424,7 +424,7 @@ mod tests {
     }
 
     #[test]
-    fn reports_that_never_reach_a_map_miss_a_goal() {
+    fn reports_missing_from_maps_miss_goal() {
         let missed = |missing| {
             let way = Quantiles {
                 p50_us: 100.0,

@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbours_see_the_same_spots_but_one() {
+    fn neighbours_share_spots_but_one() {
         let lot = landmarks();
         let spots = |vehicle| report(vehicle, &lot).seen.unwrap_or_default();
         assert_eq!(spots(30).len(), OBJECTS);
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn votes_name_the_spots_of_the_report() {
+    fn votes_name_reported_spots() {
         let vote = vote(3, &landmarks());
         assert_eq!(vote.objects[0].landmark.as_deref(), Some("slot-3"));
         let at = |report: &ObjectReport| {
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_without_locations_has_objects_all_the_same() {
+    fn cell_without_landmarks_has_objects() {
         let report = report(5, &[]);
         assert_eq!((report.objects.len(), report.seen), (OBJECTS, None));
         assert!(

@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_is_at_its_end_is_named() {
+    fn busiest_process_is_named() {
         assert!(shares(95.0, 10.0, 20.0).busiest().starts_with("broker"));
         assert!(
             shares(60.0, 10.0, 1e4)
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_load_that_did_not_go_out_is_not_the_cells_fault() {
+    fn unsent_load_blames_vehicles() {
         let blame = |refused, late| step(refused, late, shares(95.0, 1.0, 1.0)).blame();
         assert!(blame(0, 9.0).starts_with("broker"));
         for (refused, late) in [(1, 0.0), (0, 11.0)] {
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_cell_elsewhere_nothing_is_claimed() {
+    fn remote_cell_is_not_blamed() {
         let elsewhere = |vehicles| {
             step(
                 0,

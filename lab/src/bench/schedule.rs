@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_capture_time_tells_its_tick() {
+    fn capture_time_gives_tick() {
         let schedule = Schedule::starting_in(Duration::ZERO, Duration::from_millis(100));
         assert_eq!(
             schedule.begin(3) - schedule.begin(0),

@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_that_works_shows_by_its_name() {
+    fn busy_thread_is_named() {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let work = move || while stopped.try_recv() == Err(std::sync::mpsc::TryRecvError::Empty) {};
         let worker = std::thread::Builder::new()

@@ -241,7 +241,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_map_and_verdicts_in_any_encoding_tell_their_round_and_what_they_rest_on() {
+    fn every_encoding_gives_round() {
         let largest = u64::MAX >> 11;
         let fused_at = Timestamp(1_732_154_400_200_000);
         let epoch = Epoch::new(largest, NodeName::from_static("edge"));
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn verdicts_answer_what_the_map_of_their_round_or_of_one_before_did() {
+    fn verdicts_are_paired_with_maps() {
         let mut arrivals = Arrivals::none(4);
         let at = |ms| Instant::now() + std::time::Duration::from_millis(ms);
         let times: Vec<_> = (0..6).map(at).collect();

@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configurations_of_the_bundled_street_are_those_of_its_cameras() {
+    fn bundled_street_files_match_cameras() {
         let street = Street::default();
         for camera in fixed_cameras(&street) {
             let file = format!(

@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gap_of_a_term_is_that_of_the_vehicle_that_waited_longest() {
+    fn term_gap_is_longest_wait() {
         let quick = [
             taken("edge", 1, 1, 0),
             taken("edge", 1, 2, 100),

@@ -482,7 +482,7 @@ mod tests {
     use crate::street::view::StreetView;
 
     #[test]
-    fn all_that_is_read_in_a_picture_is_placed_where_its_wearer_is() {
+    fn placard_is_at_its_wearer() {
         let street = Street::default();
         let view = StreetView::new(&street).unwrap();
         let mut detector = PlacardDetector::new(PlacardConfig::default());

@@ -477,7 +477,7 @@ mod tests {
     const PLAIN: &str = "item,voter,label,truth\nx,a,cup,cup\nx,b,mouse,\ny,a,cup,mouse\n";
 
     #[test]
-    fn tables_of_any_form_are_the_same_set() {
+    fn table_layouts_give_equal_sets() {
         let plain = LabelSet::parse(PLAIN, None).unwrap();
         assert_eq!(plain.labels, ["cup", "mouse"]);
         assert_eq!((plain.items.len(), plain.judged_items()), (2, 2));
@@ -491,7 +491,7 @@ mod tests {
     }
 
     #[test]
-    fn a_later_answer_replaces_the_earlier_one() {
+    fn later_answer_replaces_earlier() {
         let set = LabelSet::parse("item,voter,label\nx,a,cup\nx,a,mouse\n", None).unwrap();
         assert_eq!(set.replaced, 1);
         let label = set.items[0].answers[0].label;
@@ -518,7 +518,7 @@ mod tests {
     }
 
     #[test]
-    fn vote_finds_the_voter_who_is_mostly_wrong() {
+    fn vote_detects_mostly_wrong_voter() {
         let mut text = "item,voter,label,truth\n".to_owned();
         for item in 0..60 {
             let truth = ["cup", "mouse"][item % 2];

@@ -35,7 +35,7 @@ fn report(node: &str, at: u64, votes: &[(&str, &str)]) -> ObjectReport {
 /// Five items, computed by hand: a is right, b wrong, c unlabelled, d empty and labelled so, e
 /// without truth.
 #[test]
-fn figures_are_those_worked_out_by_hand() {
+fn figures_match_hand_calculation() {
     let truth = Truth::parse(r#"{"landmarks": {"a": "cup", "b": "cup", "c": "mouse", "d": null}}"#)
         .unwrap();
     let mut evaluation = Evaluation::new(truth);
@@ -120,7 +120,7 @@ fn figures_are_those_worked_out_by_hand() {
 }
 
 #[test]
-fn a_truth_that_changes_makes_an_item_of_each_span() {
+fn changing_truth_makes_separate_items() {
     let truth = Truth::parse(
         r#"{"a": [{"from_us": 0, "label": "cup"}, {"from_us": 10, "label": "mouse"}]}"#,
     )
@@ -141,7 +141,7 @@ fn a_truth_that_changes_makes_an_item_of_each_span() {
 }
 
 #[test]
-fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
+fn unnamed_locations_are_placed_and_translated() {
     use ecod::perception::landmark::{Landmark, Synonym};
     let ball = Landmark {
         id: "ball".into(),
@@ -178,7 +178,7 @@ fn reports_that_name_no_location_are_placed_and_translated_as_in_the_cell() {
 }
 
 #[test]
-fn votes_are_translated_by_the_cells_synonyms_without_known_locations_too() {
+fn synonyms_apply_without_landmarks() {
     let truth = Truth::parse(r#"{"ball": "sports ball"}"#).unwrap();
     let mut evaluation =
         Evaluation::new(truth).with_synonyms([("vase".into(), "sports ball".into())].into());
@@ -195,7 +195,7 @@ fn votes_are_translated_by_the_cells_synonyms_without_known_locations_too() {
 }
 
 #[test]
-fn locations_that_never_meet_are_told_from_those_that_do() {
+fn unmatched_landmarks_are_listed() {
     let truth = || Truth::parse(r#"{"landmarks": {"a": "cup"}}"#).unwrap();
     for (id, meets) in [("a", true), ("A", false)] {
         let mut evaluation = Evaluation::new(truth());

@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_named() {
+    fn unreadable_entry_is_named() {
         for (text, part) in [
             ("", "first line is \"\""),
             ("{", "neither"),

@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_van_hides_a_pedestrian_whose_middle_is_nearer() {
+    fn long_van_hides_pedestrian() {
         // Seen along the van: its middle is farther away than the pedestrian behind its tail.
         let eye = Point2::new(-10.0, -1.5);
         let van = rectangle(0.0, 0.0, 12.0, 2.0);
@@ -73,7 +73,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_is_painted_from_its_far_end() {
+    fn row_is_painted_far_to_near() {
         let row: Vec<_> = [5.0, 15.0, 10.0]
             .map(|x| rectangle(x, 0.0, 4.0, 2.0))
             .into();

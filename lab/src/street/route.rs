@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_way_is_walked_at_its_speed_and_begins_again() {
+    fn route_is_walked_and_repeated() {
         let corners = vec![Point2::new(0.0, 0.0), Point2::new(8.0, 0.0)];
         let route = Route::Loop {
             corners,
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn cars_keep_to_the_right_and_turn_at_the_ends() {
+    fn cars_keep_right_and_turn() {
         let route = Route::road(10.0, 2.5, 4.0, 0.0);
         let [start, end, turned] =
             [0.0, 4.9, 5.0 + 2.5 * std::f64::consts::PI / 4.0 + 1.0].map(|at_s| route.at(at_s));

@@ -268,7 +268,7 @@ mod tests {
     const TEXT: &str = include_str!("../../../examples/testbed/vote_recording.json");
 
     #[test]
-    fn the_recording_is_read_in_metres_and_pixels() {
+    fn recording_is_in_metres_and_pixels() {
         let recording = IntersectionRecording::from_json(TEXT).unwrap();
         assert_eq!(
             (
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_used_is_named() {
+    fn unusable_recording_is_named() {
         for (from, to, parts) in [
             ("\"ball\"", "\"cup\"", ["objects[1].id", "used before"]),
             (

@@ -41,7 +41,7 @@ fn seen(spots: &Value) -> Vec<bool> {
 }
 
 #[test]
-fn the_recorded_setups_are_read_in_metres_and_radians() {
+fn recorded_setups_use_metres_and_radians() {
     let [first, second] = SETUPS.map(|text| Testbed::from_json(text).unwrap());
     assert_eq!((first.scenes.len(), second.scenes.len()), (5, 6));
     assert_eq!(first.camera.capture_interval, Duration::from_millis(100));
@@ -75,14 +75,14 @@ fn the_recorded_setups_are_read_in_metres_and_radians() {
 }
 
 #[test]
-fn what_is_too_small_in_the_image_cannot_be_read() {
+fn tiny_placard_is_unreadable() {
     let at = |x: f64| seen(&json!([spot(1, x, 0.0, Some("A"))]))[0];
     assert!(at(40.0), "26 px wide");
     assert!(!at(44.0), "23 px wide");
 }
 
 #[test]
-fn what_was_recorded_may_be_told_in_part() {
+fn recorded_runs_may_be_partial() {
     let mut file = lot(&json!([spot(1, 10.0, 0.0, None)]));
     file["scenes"][0]["recorded"] = json!([{"run": "14a"}, {"pace_accuracy_pct": 87.5}]);
     let recorded = read(&file).unwrap().scenes[0].recorded.clone();
@@ -96,7 +96,7 @@ fn what_was_recorded_may_be_told_in_part() {
 }
 
 #[test]
-fn other_files_of_the_kind_may_leave_much_out() {
+fn optional_keys_may_be_missing() {
     let mut file = lot(&json!([
         {"id": "north", "occupied_placard": [10, 0], "empty_placard": [10, 3]},
         {"id": 1, "occupied_placard": [10, 5], "empty_placard": null, "truth": null, "colour": "red"},
@@ -129,7 +129,7 @@ fn other_files_of_the_kind_may_leave_much_out() {
 }
 
 #[test]
-fn errors_name_the_scene_the_key_and_the_value() {
+fn errors_name_scene_and_key() {
     let broken = |change: &dyn Fn(&mut Value)| {
         let mut file = lot(&json!([spot(0, 10.0, 0.0, None), spot(1, 10.0, 5.0, None)]));
         change(&mut file);
@@ -191,7 +191,7 @@ fn errors_name_the_scene_the_key_and_the_value() {
 }
 
 #[test]
-fn a_spot_is_seen_from_the_front_and_whole() {
+fn spot_is_visible_frontally_and_whole() {
     assert_eq!(seen(&json!([spot(0, 15.0, 0.0, Some("A"))])), [true]);
     let edge = 15.0 * 31.1f64.to_radians().tan() - 1.9375 / 2.0;
     assert_eq!(
@@ -224,7 +224,7 @@ fn a_spot_is_seen_from_the_front_and_whole() {
 }
 
 #[test]
-fn a_parked_vehicle_hides_what_is_behind_it() {
+fn parked_vehicle_hides_objects_behind() {
     let cover = |y: f64| {
         seen(&json!([
             spot(0, 16.0, 0.0, None),

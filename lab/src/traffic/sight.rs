@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_hides_what_is_behind_it_and_nothing_else() {
+    fn vehicle_hides_only_objects_behind() {
         let queue = [
             car(0.0, -2.0),
             car(10.0, -2.0),
@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn a_building_hides_the_next_road() {
+    fn building_hides_next_road() {
         // The building stands between 10 and 70 m on both axes.
         let corner = [car(0.0, 40.0), car(40.0, 0.0), car(5.0, 80.0)];
         assert_eq!([1, 2].map(|body| share(&corner, body)), [0.0, 1.0]);

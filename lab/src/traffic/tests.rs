@@ -51,7 +51,7 @@ fn equal_seeds_give_equal_traffic() {
 }
 
 #[test]
-fn what_is_written_is_read_as_recording_and_truth() {
+fn written_recording_is_readable() {
     let recording = generated(&small(), 1);
     assert!(
         recording.reports.len() > 70,
@@ -75,7 +75,7 @@ fn what_is_written_is_read_as_recording_and_truth() {
 }
 
 #[test]
-fn vehicles_move_stop_and_keep_apart() {
+fn vehicles_move_stop_and_keep_distance() {
     let config = TrafficConfig {
         observers: 30,
         duration_s: 40.0,
@@ -145,7 +145,7 @@ fn vehicles_move_stop_and_keep_apart() {
 }
 
 #[test]
-fn detections_are_near_the_truth_and_false_alarms_are_not() {
+fn only_detections_are_near_truth() {
     let within = |config: &TrafficConfig, limit: f64| {
         let errors = errors(&generated(config, 5));
         errors.iter().filter(|error| **error < limit).count() as f64 / errors.len() as f64
@@ -185,7 +185,7 @@ fn more_observers_see_more() {
 }
 
 #[test]
-fn whoever_stands_reports_from_its_place() {
+fn standing_vehicle_reports_from_one_place() {
     let recording = generated(
         &TrafficConfig {
             observers: 3,
@@ -217,7 +217,7 @@ fn whoever_stands_reports_from_its_place() {
 }
 
 #[test]
-fn a_recording_of_two_vehicles_says_no_more_than_they_did() {
+fn two_vehicle_recording_has_two_reporters() {
     let config = TrafficConfig {
         duration_s: 2.0,
         ..TrafficConfig::two_vehicle_recording()

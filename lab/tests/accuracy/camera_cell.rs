@@ -46,7 +46,7 @@ async fn more_frames(vehicle: &NodeHandle) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_killed() {
+async fn plate_survives_killed_parts() {
     let file =
         PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
     let testbed = Testbed::from_json(&std::fs::read_to_string(&file).unwrap()).unwrap();

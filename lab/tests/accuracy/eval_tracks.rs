@@ -38,7 +38,7 @@ fn compare(path: &str, found: &Value, expected: &Value) -> usize {
 }
 
 #[test]
-fn figures_are_those_of_trackeval_and_motmetrics() {
+fn figures_match_trackeval_and_motmetrics() {
     let mut evaluation = TrackEvaluation::new(TrackTruth::parse(TRUTH).unwrap());
     for line in MAPS.lines() {
         evaluation.map(&serde_json::from_str::<GlobalMap>(line).unwrap());

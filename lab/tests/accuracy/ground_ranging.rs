@@ -227,7 +227,7 @@ const A_DEGREE: Unknown = Unknown {
 };
 
 #[test]
-fn posts_in_rendered_frames_are_placed_within_two_percent_of_the_range() {
+fn rendered_posts_within_two_percent() {
     let mut dice = Dice(ChaCha8Rng::seed_from_u64(7));
     for camera_m in HEIGHTS_M {
         let testbed = street(camera_m);
@@ -273,8 +273,7 @@ fn posts_in_rendered_frames_are_placed_within_two_percent_of_the_range() {
 }
 
 #[test]
-fn the_stated_covariance_holds_95_percent_of_the_errors_in_rendered_frames_with_an_exact_mount_and_with_a_degree_of_unknown_tilt()
- {
+fn covariance_covers_95_percent() {
     let mut dice = Dice(ChaCha8Rng::seed_from_u64(8));
     let mut failures = Vec::new();
     for camera_m in HEIGHTS_M {

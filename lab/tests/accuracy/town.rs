@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 #[test]
-fn what_drives_from_cell_to_cell_keeps_its_identity() {
+fn identity_survives_change_of_cell() {
     let traffic = town_traffic(2, 25.0);
     traffic.validate().unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(4001);

@@ -73,7 +73,7 @@ fn fuse_by(
 }
 
 #[test]
-fn traffic_is_tracked_better_than_late_fusion_does_it() {
+fn tracking_beats_late_fusion() {
     let town = TrafficConfig {
         observers: 8,
         duration_s: 12.0,
@@ -192,7 +192,7 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
 }
 
 #[test]
-fn velocities_headings_and_sizes_that_are_said_make_maps_better() {
+fn stated_velocities_headings_sizes_improve_maps() {
     let plain = errors(SaidConfig::default());
     let rich = SaidConfig {
         velocities_mps: Some(0.6),
@@ -347,12 +347,12 @@ fn assert_better(scene: &str, figures: [[f64; 6]; 4]) {
 }
 
 #[test]
-fn alignment_costs_cameras_whose_poses_are_right_nothing_and_they_are_better_together() {
+fn alignment_costs_correct_cameras_little() {
     assert_best("0.02 m", means(|seed| two_posts(seed, 0.02)));
 }
 
 #[test]
-fn alignment_makes_maps_of_cameras_on_posts_better() {
+fn alignment_improves_fixed_cameras() {
     for pose_m in [0.1, 0.35] {
         assert_better(
             &format!("{pose_m} m"),
@@ -362,7 +362,7 @@ fn alignment_makes_maps_of_cameras_on_posts_better() {
 }
 
 #[test]
-fn alignment_makes_maps_of_stamps_that_differ_better() {
+fn alignment_corrects_differing_stamps() {
     assert_better("stamps", means(stamped_late));
 }
 
@@ -387,7 +387,7 @@ fn calibration(config: &TrafficConfig) -> [f64; 2] {
 }
 
 #[test]
-fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
+fn confidences_match_observed_frequencies() {
     let town = TrafficConfig {
         duration_s: 15.0,
         ..TrafficConfig::default()

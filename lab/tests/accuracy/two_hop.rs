@@ -7,7 +7,7 @@ use ecod_actors::transport::mqtt::BrokerAddress;
 use ecod_lab::bench::two_hop::{TwoHopError, TwoHopLoad, raw};
 
 #[tokio::test]
-async fn every_message_but_the_warm_up_is_timed() {
+async fn messages_after_warmup_are_timed() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address: BrokerAddress = broker.start("127.0.0.1:0".parse().unwrap()).unwrap().into();
     let load = TwoHopLoad {

@@ -10,7 +10,7 @@ fn bench(arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn a_cell_of_its_own_is_measured_and_other_figures_stay() {
+fn started_cell_is_measured_keeping_figures() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("figures.json");
     std::fs::write(&file, r#"{"core":{"x":1}}"#).unwrap();
@@ -79,7 +79,7 @@ fn a_cell_of_its_own_is_measured_and_other_figures_stay() {
 }
 
 #[test]
-fn costs_are_measured_without_and_with_recording() {
+fn costs_are_measured_with_recording() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("figures.json");
     let output = bench(&["--costs", "--seconds", "2", "--out", file.to_str().unwrap()]);
@@ -107,7 +107,7 @@ fn costs_are_measured_without_and_with_recording() {
 }
 
 #[test]
-fn a_closed_cell_is_refused_in_words() {
+fn closed_cell_names_reason() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("cell.toml");
     let tls = "name = \"euclid\"\n[tls]\nca = \"ca.pem\"\ncertificate = \"euclid.pem\"\nkey = \"euclid.key\"\n";
@@ -126,7 +126,7 @@ fn a_closed_cell_is_refused_in_words() {
 }
 
 #[test]
-fn a_broker_that_is_not_there_is_named() {
+fn missing_broker_is_named() {
     let address = std::net::TcpListener::bind("127.0.0.1:0")
         .unwrap()
         .local_addr()

@@ -24,7 +24,7 @@ fn scenes() -> PathBuf {
 }
 
 #[test]
-fn an_output_that_cannot_be_written_is_told_of_before_the_run() {
+fn unwritable_output_fails_before_run() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("file");
     std::fs::write(&file, "kept").unwrap();
@@ -76,7 +76,7 @@ fn result_of(change: impl Fn(&mut serde_json::Value)) -> serde_json::Value {
 }
 
 #[test]
-fn scenes_may_differ_from_the_recorded_ones() {
+fn scenes_may_differ_from_recording() {
     let free_without_placards = result_of(|file| {
         for spot in file["scenes"][1]["spots"].as_array_mut().unwrap() {
             spot.as_object_mut().unwrap().remove("empty_placard");
@@ -126,7 +126,7 @@ fn until(what: &str, reached: impl Fn() -> bool) {
 }
 
 #[test]
-fn a_demo_that_is_killed_leaves_no_nodes_behind() {
+fn killed_demo_leaves_no_nodes() {
     let directory = tempfile::tempdir().unwrap();
     let mut demo = ecod_lab();
     demo.args(["demo", "--scene", "setup1-lot1", "--out"])
@@ -151,7 +151,7 @@ fn a_demo_that_is_killed_leaves_no_nodes_behind() {
 }
 
 #[test]
-fn in_the_street_the_cell_knows_more_than_any_camera_and_survives_its_edge() {
+fn street_cell_outperforms_cameras_after_failover() {
     let directory = tempfile::tempdir().unwrap();
     let mut demo = ecod_lab();
     demo.args(["demo", "--scene", "street", "--seconds", "10", "--out"])

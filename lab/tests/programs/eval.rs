@@ -83,7 +83,7 @@ fn replay_lot(folder: &TempDir) -> PathBuf {
 }
 
 #[test]
-fn a_replay_is_judged_beside_majority_and_every_vehicle() {
+fn replay_is_compared_with_majority() {
     let folder = TempDir::new().unwrap();
     let output = replay_lot(&folder);
     let truth = example("recordings/lot_truth.json");
@@ -123,7 +123,7 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
 }
 
 #[test]
-fn objects_that_move_are_judged_by_where_they_were() {
+fn moving_objects_use_past_positions() {
     let folder = TempDir::new().unwrap();
     let recorded = |name: &str| {
         Path::new(concat!(
@@ -179,7 +179,7 @@ fn objects_that_move_are_judged_by_where_they_were() {
 
 /// Two cars in four frames of KITTI: the tracker loses one and calls the other by two names.
 #[test]
-fn files_of_benchmarks_are_judged_by_name_line_and_field() {
+fn benchmark_file_errors_name_line() {
     let folder = TempDir::new().unwrap();
     let line = |frame: u32, track: u32, x: f64, z: f64, score: &str| {
         format!("{frame} {track} Car 0 0 -1 0 0 9 9 1.5 1.6 3.9 {x} 1.7 {z} 0 {score}\n")
@@ -242,7 +242,7 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
 
 /// Two cameras detect a person; a replay of what they said has one.
 #[test]
-fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
+fn benchmark_detections_become_reports() {
     let folder = TempDir::new().unwrap();
     let file = |name: &str, content: String| {
         let path = folder.path().join(name);
@@ -296,7 +296,7 @@ fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
 
 /// Two vehicles, one of which detects nothing in the first sequence, and truth of one sequence more.
 #[test]
-fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these() {
+fn sequences_match_names_and_truth() {
     let folder = TempDir::new().unwrap();
     let path = |name: &str| folder.path().join(name);
     let each = |place: &str| {
@@ -376,7 +376,7 @@ fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these()
 }
 
 #[test]
-fn a_truth_without_identities_judges_none() {
+fn truth_without_identities_judges_none() {
     let folder = TempDir::new().unwrap();
     let truth = folder.path().join("truth.txt");
     let maps = folder.path().join("maps.txt");
@@ -400,7 +400,7 @@ fn a_truth_without_identities_judges_none() {
 }
 
 #[test]
-fn the_recorded_intersection_is_judged_right() {
+fn recorded_intersection_is_judged_right() {
     let folder = TempDir::new().unwrap();
     let scenes = example("testbed/vote_recording.json");
     let out = folder.path().join("result.json");
@@ -432,7 +432,7 @@ fn the_recorded_intersection_is_judged_right() {
 }
 
 #[test]
-fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_intersection() {
+fn silent_vehicles_spoil_no_intersection() {
     let folder = TempDir::new().unwrap();
     let recorded = fs::read_to_string(example("testbed/vote_recording.json")).unwrap();
     let mut silent: Value = serde_json::from_str(&recorded).unwrap();
@@ -467,7 +467,7 @@ fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_interse
 }
 
 #[test]
-fn what_cannot_be_judged_is_said() {
+fn unjudgeable_input_is_reported() {
     let folder = TempDir::new().unwrap();
     let file = |name: &str, content: &str| {
         let path = folder.path().join(name);
@@ -518,7 +518,7 @@ fn what_cannot_be_judged_is_said() {
 
 /// A method of one's own beside ECOD, by the template in the manual.
 #[test]
-fn methods_are_compared_in_one_table() {
+fn methods_share_one_table() {
     let folder = TempDir::new().unwrap();
     let own = folder.path().join("own.jsonl");
     let table = folder.path().join("table");
@@ -562,7 +562,7 @@ fn methods_are_compared_in_one_table() {
 }
 
 #[test]
-fn what_a_line_of_output_lacks_is_named() {
+fn missing_output_field_is_named() {
     let folder = TempDir::new().unwrap();
     let input = folder.path().join("own.jsonl");
     let map = r#"{"schema":1,"aggregator":"own","epoch":1,"round":1,"fused_at_us":1,"landmarks":[],

@@ -160,7 +160,7 @@ fn write_log(path: &Path) {
 }
 
 #[test]
-fn a_report_says_who_led_how_late_how_steadily_on_whom_it_rests_and_what_was_lost() {
+fn report_covers_leaders_delays_and_losses() {
     let folder = tempfile::tempdir().unwrap();
     let [log, later] = ["log.mcap", "later.mcap"].map(|name| folder.path().join(name));
     write_log(&log);
@@ -223,7 +223,7 @@ fn a_report_says_who_led_how_late_how_steadily_on_whom_it_rests_and_what_was_los
 
 /// A cell without known locations: what its maps rest on, and how right they are, is that of their objects.
 #[test]
-fn a_report_of_the_open_world_is_about_objects() {
+fn open_world_report_covers_objects() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log.mcap");
     let mut log = Log::begin(&path, 1);
@@ -283,7 +283,7 @@ fn map(leader: &str, epoch: u64, round: u64, fused_at_us: u64) -> Value {
 /// A node that was started again with its clock an hour back, a log that was silent for a while under the same leader,
 /// and a leader that came back: all are in order, by the cell's time.
 #[test]
-fn a_timeline_is_in_order_whatever_happened_to_clocks_leaders_and_log() {
+fn timeline_stays_in_order() {
     let folder = tempfile::tempdir().unwrap();
     let [before, after] = ["1.mcap", "2.mcap"].map(|name| folder.path().join(name));
     let status = |node: &str, state: &str, troubles: Value| {

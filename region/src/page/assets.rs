@@ -40,7 +40,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_has_all_that_it_names_and_nothing_from_elsewhere() {
+    fn page_has_no_foreign_content() {
         for (path, _, content) in OWN {
             for forbidden in ["https://", "style=", "onclick=", "innerHTML", "eval("] {
                 assert!(!content.contains(forbidden), "{path}: {forbidden}");

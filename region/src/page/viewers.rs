@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tile_is_read_while_somebody_looks_and_once_only() {
+    fn viewed_tile_is_read_once() {
         let mut viewers = Viewers::new(vec![tile("0")]);
         let read = |viewers: &mut Viewers, ms| viewers.tiles(|_| 1, at(ms)).0;
         viewers
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_host_with_many_views_gives_way_to_others_and_keeps_an_even_share() {
+    fn host_with_many_views_keeps_share() {
         let mut viewers = Viewers::new(Vec::new());
         for number in 0..200 {
             let looked = viewers.look(viewer(1, number), vec![numbered(number)], at(1000));
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn an_idle_view_makes_room_first() {
+    fn idle_view_is_evicted_first() {
         let mut viewers = Viewers::new(Vec::new());
         viewers.look(viewer(2, 0), vec![tile("3")], at(0)).unwrap();
         for number in 1..MAX_VIEWS {
@@ -298,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn small_views_are_read_before_large_ones_and_a_host_is_no_better_for_having_many() {
+    fn small_views_are_read_first() {
         let mut viewers = Viewers::new(Vec::new());
         // Each tile of four digits has 100 cells.
         let count = |tiles: &[Quadkey]| 100 * tiles.len();

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_view_is_covered_by_few_tiles_whatever_its_size() {
+    fn any_view_needs_few_tiles() {
         for (text, max_digits) in [
             ("2.29,48.85,2.30,48.86", 15),
             ("2.0,48.5,2.6,49.1", 11),

@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_tile_is_read_as_long_as_the_one_that_it_is_in() {
+    fn child_tile_inherits_read_time() {
         let tile = |key: &str| key.parse::<Quadkey>().unwrap();
         let mut read = ReadTiles::default();
         read.replace([tile("12"), tile("3")].into_iter(), Timestamp(5));

@@ -96,7 +96,7 @@ fn status(
 }
 
 #[test]
-fn a_cell_that_floods_is_held_to_its_rate_and_others_are_heard() {
+fn only_flooding_cell_is_limited() {
     let mut town = RegionTown::default();
     for number in 0..1000 {
         let _ = map(&mut town, "flood", number + 1, number, &[]);
@@ -118,7 +118,7 @@ fn a_cell_that_floods_is_held_to_its_rate_and_others_are_heard() {
 }
 
 #[test]
-fn objects_beyond_a_cells_area_are_counted_and_not_shown() {
+fn objects_outside_area_are_counted() {
     let mut town = RegionTown::default();
     for round in 1..=20 {
         let _ = map(
@@ -153,7 +153,7 @@ fn objects_beyond_a_cells_area_are_counted_and_not_shown() {
 }
 
 #[test]
-fn what_is_kept_of_a_cell_is_bounded() {
+fn kept_data_is_bounded() {
     let mut town = RegionTown::default();
     for round in 1..=20 {
         let _ = map(
@@ -187,7 +187,7 @@ fn what_is_kept_of_a_cell_is_bounded() {
 }
 
 #[test]
-fn a_cell_is_silent_only_when_a_map_was_due() {
+fn silence_starts_at_due_map() {
     let mut town = RegionTown::default();
     status(&mut town, "lot", 0, NodeState::Aggregating).unwrap();
     let state = |town: &RegionTown, read_ms: Option<u64>, ms: u64| {

@@ -12,7 +12,7 @@ use crate::broker::{Broker, LOT, until};
 use crate::cell::Cell;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn servers_of_a_cluster_know_each_other_by_certificates_and_pass_maps_on() {
+async fn certified_servers_exchange_maps() {
     let servers = Broker::cluster();
     let state = servers[1].read(|_| ());
     until("the reader is let in", || state.link().is_up).await;

@@ -211,7 +211,7 @@ async fn publish(client: AsyncClient, stop: Arc<AtomicBool>) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn ten_thousand_cells_are_on_the_page() {
+async fn ten_thousand_cells_are_shown() {
     let broker = Broker::mosquitto();
     let (client, mut events) = AsyncClient::new(broker.login("town").options(), 4096);
     tokio::spawn(async move { while events.poll().await.is_ok() {} });

@@ -58,7 +58,7 @@ fn publish(lot: &Cell, far: &Cell, round: u64) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_page_counts_what_is_in_view_and_reads_no_more() {
+async fn page_counts_cells_in_view() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     let far = Cell::connect(&broker, FAR);
@@ -230,7 +230,7 @@ async fn a_town_is_exported() {
 }
 
 #[test]
-fn a_page_that_others_reach_needs_a_token() {
+fn reachable_page_needs_token() {
     let output = Command::new(env!("CARGO_BIN_EXE_ecod-region"))
         .args(["serve", "--broker", "127.0.0.1:1", "--listen", "0.0.0.0:0"])
         .output()

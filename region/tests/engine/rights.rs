@@ -97,7 +97,7 @@ fn honest(lot: &Cell, far: &Cell) -> BTreeSet<String> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
+async fn nats_rights_end_at_tile() {
     let broker = Broker::nats();
     let arrived = listen(&broker).await;
     let heard = attack(&broker, &arrived).await;
@@ -128,7 +128,7 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn on_mosquitto_a_cell_writes_below_its_own_tile_and_hears_the_tiles_around() {
+async fn mosquitto_rights_end_at_tile() {
     let broker = Broker::mosquitto();
     let arrived = listen(&broker).await;
     let heard = attack(&broker, &arrived).await;
@@ -161,7 +161,7 @@ async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cell_is_added_while_the_others_stay_connected() {
+async fn adding_cell_disconnects_no_others() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     until("the cell is in", || lot.heard().logins == 1).await;
@@ -196,7 +196,7 @@ async fn the_streams_are_made_once() {
 }
 
 #[test]
-fn junk_of_a_cell_is_counted_and_harms_nothing() {
+fn junk_of_cell_is_counted() {
     let mut town = RegionTown::default();
     let now = ecod_actors::platform::clock::now();
     for (path, payload) in [

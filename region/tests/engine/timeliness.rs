@@ -14,7 +14,7 @@ use crate::cell::Cell;
 const TOLERANCE: Duration = Duration::from_millis(200);
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_burst_of_old_maps_after_a_pause_reaches_nobody() {
+async fn delayed_maps_are_dropped() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     // True ages of the maps that count: this machine has one clock.

@@ -15,7 +15,7 @@ fn window() -> ReportWindow {
 }
 
 #[test]
-fn takes_each_report_once_and_in_order() {
+fn takes_reports_once_in_order() {
     let mut window = window();
     let now = Timestamp(NOON + 10_000);
     assert_eq!(
@@ -41,7 +41,7 @@ fn takes_each_report_once_and_in_order() {
 }
 
 #[test]
-fn an_overtaken_report_is_told_from_a_duplicate_as_long_as_it_is_remembered() {
+fn overtaken_report_is_no_duplicate() {
     let mut window = window();
     let now = Timestamp(NOON + 810_000);
     for n in 1..=40 {
@@ -97,7 +97,7 @@ fn tomorrow_and_yesterday_are_rejected() {
 }
 
 #[test]
-fn a_clock_one_and_a_half_seconds_ahead_is_corrected() {
+fn fast_clock_is_corrected() {
     let mut window = window();
     for step in 0..20 {
         let sent = NOON + step * 100_000;
@@ -122,7 +122,7 @@ fn a_clock_one_and_a_half_seconds_ahead_is_corrected() {
 }
 
 #[test]
-fn a_vehicle_that_invents_parts_takes_nobody_elses_room() {
+fn invented_parts_take_no_room() {
     let mut window = window();
     let admitted = (0..100)
         .filter(|n| {
@@ -160,7 +160,7 @@ fn admitted_around_a_wrong_stamp(wrong: u64, ahead_us: u64) -> Vec<bool> {
 }
 
 #[test]
-fn one_wrong_stamp_silences_its_vehicle_for_a_second_at_most() {
+fn wrong_stamp_silences_one_second() {
     for wrong in [0, 1, 2, 50, 101] {
         for ahead_us in [100_000, 400_000, 600_000, 1_000_000, 1_900_000] {
             let admitted = admitted_around_a_wrong_stamp(wrong, ahead_us);
@@ -174,7 +174,7 @@ fn one_wrong_stamp_silences_its_vehicle_for_a_second_at_most() {
 }
 
 #[test]
-fn a_clock_that_was_set_forward_is_followed_and_a_duplicate_confirms_nothing() {
+fn forward_clock_is_followed() {
     let mut window = window();
     let sent = |n: u64| NOON + n * 100_000;
     for n in 0..10 {
@@ -203,7 +203,7 @@ fn a_clock_that_was_set_forward_is_followed_and_a_duplicate_confirms_nothing() {
 }
 
 #[test]
-fn a_delayed_report_from_a_synchronised_vehicle_is_stale() {
+fn synchronised_late_report_is_stale() {
     let mut window = window();
     assert!(
         window
@@ -215,7 +215,7 @@ fn a_delayed_report_from_a_synchronised_vehicle_is_stale() {
 }
 
 #[test]
-fn a_vehicle_whose_clock_was_set_back_is_heard_again() {
+fn backward_clock_is_accepted_again() {
     let config = WindowConfig {
         max_clock_offset_s: 10.0,
         ..WindowConfig::default()
@@ -234,7 +234,7 @@ fn a_vehicle_whose_clock_was_set_back_is_heard_again() {
 }
 
 #[test]
-fn vehicles_are_bounded_and_silent_ones_make_room() {
+fn vehicles_are_bounded_evicting_silent() {
     let mut window = ReportWindow::new(WindowConfig {
         max_vehicles: 2,
         ..WindowConfig::default()
@@ -280,7 +280,7 @@ fn lost(
 const YEAR_US: i64 = 31_536_000_000_000;
 
 #[test]
-fn a_step_of_a_clock_silences_its_vehicle_for_a_second_or_so() {
+fn clock_step_silences_briefly() {
     for step_us in [
         -3_000_000, -1_200_000, 1_200_000, 5_000_000, -5_000_000, -YEAR_US, YEAR_US,
     ] {
@@ -295,7 +295,7 @@ fn a_step_of_a_clock_silences_its_vehicle_for_a_second_or_so() {
 }
 
 #[test]
-fn a_live_stream_is_heard_whatever_its_clock_says() {
+fn live_stream_passes_any_clock() {
     for ahead_us in [-YEAR_US, -9_000_000, 9_000_000, YEAR_US] {
         assert!(
             lost(&mut window(), 0..100, |_| ahead_us) <= 11,
@@ -305,7 +305,7 @@ fn a_live_stream_is_heard_whatever_its_clock_says() {
 }
 
 #[test]
-fn a_queue_that_empties_is_no_live_stream() {
+fn emptying_queue_is_not_live() {
     let mut window = window();
     assert_eq!(lost(&mut window, 0..10, |_| 0), 0);
     for n in 10..40 {
@@ -326,7 +326,7 @@ fn in_cell_time(n: u64, cell_offset_us: i64) -> ObjectReport {
 }
 
 #[test]
-fn a_jump_of_the_cells_time_costs_no_report_of_those_who_hear_of_it_late() {
+fn time_jump_costs_no_report() {
     let mut window = window();
     let mut offset_us = -YEAR_US;
     window.set_cell_offset(offset_us);
@@ -352,7 +352,7 @@ fn a_jump_of_the_cells_time_costs_no_report_of_those_who_hear_of_it_late() {
 }
 
 #[test]
-fn a_report_in_cell_time_that_was_under_way_for_long_is_stale_however_steadily_they_come() {
+fn late_cell_time_is_stale() {
     let mut window = window();
     for n in 0..100 {
         let admitted = window.admit(
@@ -364,7 +364,7 @@ fn a_report_in_cell_time_that_was_under_way_for_long_is_stale_however_steadily_t
 }
 
 #[test]
-fn a_vehicle_that_mistakes_the_cells_time_is_heard_by_its_own() {
+fn mistaken_cell_time_falls_back() {
     let mut window = window();
     let silent = (0..100).filter(|n| {
         let received = Timestamp(NOON + n * 100_000 + 2_000);
@@ -376,7 +376,7 @@ fn a_vehicle_that_mistakes_the_cells_time_is_heard_by_its_own() {
 }
 
 #[test]
-fn vehicles_that_are_rejected_for_their_time_on_and_on_are_untimely() {
+fn repeated_time_rejections_are_untimely() {
     let mut window = window();
     let mut heard = |n: u64, node: &str, ahead_us: u64| {
         let sent = NOON + n * 100_000;

@@ -97,7 +97,7 @@ fn honest_report(captured_ms: u64) -> Arc<ObjectReport> {
 
 proptest! {
     #[test]
-    fn any_valid_reports_make_rounds_that_every_receiver_accepts(reports in vec(extreme_report(), 1..6)) {
+    fn valid_reports_make_acceptable_rounds(reports in vec(extreme_report(), 1..6)) {
         for report in &reports {
             prop_assert_eq!(report.validate(&Limits::default()), Ok(()));
         }
@@ -130,7 +130,7 @@ proptest! {
     }
 
     #[test]
-    fn an_object_that_leaves_the_bounds_is_left_out_and_its_vehicle_named(steps in 1u64..30) {
+    fn object_beyond_bounds_is_omitted(steps in 1u64..30) {
         let tracks = TracksConfig { mode: TracksMode::On, ..TracksConfig::default() };
         let mut cell = leader(FusionConfig { tracks, ..FusionConfig::default() });
         let edge_of_the_world = PerceivedObject {

@@ -73,7 +73,7 @@ fn verdicts(fused: &Fused) -> Vec<(&str, Option<&str>)> {
 }
 
 #[test]
-fn a_change_keeps_votes_tracks_and_trust_of_places_that_are_still_there() {
+fn change_keeps_remaining_landmarks() {
     for mode in [PaceMode::Bayes, PaceMode::Paper] {
         let (mut cell, before) = running(&settings(mode));
         assert_eq!(labels(&before), [("a", Some("cup")), ("b", Some("vase"))]);
@@ -116,7 +116,7 @@ fn a_change_keeps_votes_tracks_and_trust_of_places_that_are_still_there() {
 }
 
 #[test]
-fn an_algorithm_that_is_switched_on_starts_and_one_that_is_switched_off_ends() {
+fn switched_algorithm_starts_or_ends() {
     let (mut cell, _) = running(&settings(PaceMode::Bayes));
     let places = [place("a", 0.0), place("b", 10.0)];
     let only_votes = FusionConfig {
@@ -140,7 +140,7 @@ fn an_algorithm_that_is_switched_on_starts_and_one_that_is_switched_off_ends() {
 }
 
 #[test]
-fn a_cell_whose_last_place_is_taken_away_learns_places_from_votes_again() {
+fn removing_last_landmark_resumes_learning() {
     let (mut cell, _) = running(&settings(PaceMode::Bayes));
     cell.configure(settings(PaceMode::Bayes), Vec::new());
     cell.report(VoteDetections, &seen_by("euclid", 2050), at(2050))

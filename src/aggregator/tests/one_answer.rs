@@ -83,7 +83,7 @@ fn readings(fused: &Fused) -> Vec<(String, Vec<String>)> {
 /// A vehicle at the side reads the sign behind a plate: this is not a vote against the plate, and
 /// the vehicle does not count as wrong.
 #[test]
-fn a_sign_behind_a_plate_is_no_vote_against_it() {
+fn sign_behind_plate_is_no_contradiction() {
     let mut lot = Lot::new();
     let fused = lot.read(30, &[("euclid", "MNOP101"), ("galileo", "EMPTY")]);
     assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
@@ -99,7 +99,7 @@ fn a_sign_behind_a_plate_is_no_vote_against_it() {
 
 /// Maps are sent ten times a second, so a label on which all agree is stated only once.
 #[test]
-fn readings_are_told_where_they_differ_and_not_where_all_agree() {
+fn only_differing_readings_are_listed() {
     let names = ["euclid", "gauss", "galileo", "noether"];
     let agreeing = Lot::new().read(5, &names.map(|name| (name, "MNOP101")));
     assert_eq!(
@@ -118,7 +118,7 @@ fn readings_are_told_where_they_differ_and_not_where_all_agree() {
 }
 
 #[test]
-fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
+fn invented_plate_cannot_outvote_sign() {
     let mut lot = Lot::new();
     let honest = [
         ("euclid", "EMPTY"),
@@ -138,7 +138,7 @@ fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
 }
 
 #[test]
-fn a_known_liar_does_not_outvote_the_only_one_who_reads_the_sign() {
+fn distrusted_vehicle_cannot_outvote_reader() {
     let mut lot = Lot::new();
     lot.read(
         20,
@@ -155,7 +155,7 @@ fn a_known_liar_does_not_outvote_the_only_one_who_reads_the_sign() {
 
 /// A vehicle states the sign by a synonym: it is still no vote against the plate before it.
 #[test]
-fn a_sign_by_its_synonym_is_no_vote_either() {
+fn sign_synonym_is_no_contradiction() {
     let mut lot = Lot::new();
     let fused = lot.read(30, &[("euclid", "MNOP101"), ("galileo", "VACANT")]);
     assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
@@ -168,7 +168,7 @@ fn a_sign_by_its_synonym_is_no_vote_either() {
 /// Map and verdict give the same answer, independent of earlier reputation: when the car leaves,
 /// when another arrives, and when two vehicles differ.
 #[test]
-fn map_and_verdict_say_the_same() {
+fn map_and_verdict_agree() {
     let mut lot = Lot::new();
     let all = |label: &'static str| [("euclid", label), ("gauss", label), ("galileo", label)];
     for label in ["MNOP101", "EMPTY", "QRST202", "EMPTY"] {

@@ -173,7 +173,7 @@ impl Cell {
 }
 
 #[test]
-fn all_agree_on_the_median_of_the_candidates_whatever_their_steady_clocks_say() {
+fn cell_time_is_candidates_median() {
     let year = 31_536_000 * SECOND_US;
     let mut cell = Cell::new(&[
         (Role::Edge, TO_1970_US, TO_1970_US),
@@ -189,7 +189,7 @@ fn all_agree_on_the_median_of_the_candidates_whatever_their_steady_clocks_say() 
 }
 
 #[test]
-fn a_step_of_any_vehicle_moves_nothing_and_is_told_once() {
+fn vehicle_step_moves_no_time() {
     let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Cav, 0, 0)]);
     cell.run(3);
     for index in 1..3 {
@@ -205,7 +205,7 @@ fn a_step_of_any_vehicle_moves_nothing_and_is_told_once() {
 }
 
 #[test]
-fn a_leader_whose_clock_is_off_by_microseconds_moves_the_time_and_no_log_tells_of_a_jump() {
+fn microsecond_offset_logs_no_jump() {
     let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 33)]);
     cell.run(5);
     cell.leader = 1;
@@ -215,7 +215,7 @@ fn a_leader_whose_clock_is_off_by_microseconds_moves_the_time_and_no_log_tells_o
 }
 
 #[test]
-fn a_leader_that_steps_moves_the_cells_time_only_where_nobody_else_could_lead() {
+fn stepping_leader_moves_time_when_alone() {
     for (others, expected) in [(2, 0), (1, 0), (0, 5 * SECOND_US)] {
         let mut nodes = vec![(Role::Edge, 0, 0), (Role::Cav, 0, 0)];
         nodes.extend(vec![(Role::Auto, 0, 0); others]);
@@ -231,7 +231,7 @@ fn a_leader_that_steps_moves_the_cells_time_only_where_nobody_else_could_lead() 
 }
 
 #[test]
-fn a_leader_from_1970_is_followed_and_set_right_when_its_clock_is() {
+fn leader_from_1970_is_followed() {
     let mut cell = Cell::new(&[(Role::Edge, TO_1970_US, TO_1970_US), (Role::Cav, 0, 0)]);
     cell.run(2);
     cell.all_know(TO_1970_US, 5_000);
@@ -246,7 +246,7 @@ fn a_leader_from_1970_is_followed_and_set_right_when_its_clock_is() {
 }
 
 #[test]
-fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
+fn new_leader_continues_time_slowly() {
     let ahead = 400_000;
     let mut cell = Cell::new(&[
         (Role::Edge, 0, ahead),
@@ -267,7 +267,7 @@ fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
 /// A wrong clock does not affect the cell's time, and both its own node and the leader report it by
 /// name. This includes a vehicle's clock.
 #[test]
-fn clocks_that_are_off_are_known_by_name() {
+fn wrong_clocks_are_named() {
     let mut cell = Cell::new(&[
         (Role::Edge, 0, 0),
         (Role::Auto, 7 * SECOND_US, 100_000),
@@ -334,7 +334,7 @@ fn clocks_that_are_off_are_known_by_name() {
 /// A leader with a wrong clock that is not outvoted imposes its time on the cell; the other clocks
 /// agree and are not reported. With two differing clocks, the report is uncertain for both.
 #[test]
-fn of_clocks_that_differ_the_ones_that_agree_are_right() {
+fn agreeing_clocks_are_not_reported() {
     let wrong = |nodes: &[(Role, i64, i64)]| {
         let mut cell = Cell::new(nodes);
         cell.run(10);
@@ -364,7 +364,7 @@ fn of_clocks_that_differ_the_ones_that_agree_are_right() {
 }
 
 #[test]
-fn stamps_of_a_liar_are_survived() {
+fn false_stamps_move_no_time() {
     let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Auto, 0, 0)]);
     cell.run(2);
     let extremes = [Timestamp(0), Timestamp(MAX_INTEGER)];
@@ -413,7 +413,7 @@ fn stamps_of_a_liar_are_survived() {
 }
 
 #[test]
-fn a_leader_that_is_not_trusted_any_more_has_no_say_in_its_successors_time() {
+fn expelled_leader_sets_no_time() {
     let forged = 5 * SECOND_US;
     let mut cell = Cell::new(&[(Role::Edge, 0, forged), (Role::Auto, 0, 0)]);
     cell.run(3);

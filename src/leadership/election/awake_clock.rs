@@ -53,7 +53,7 @@ mod tests {
     const MS: u64 = 1000;
 
     #[test]
-    fn stalls_and_set_clocks_are_not_time() {
+    fn stalls_and_set_clocks_excluded() {
         let at = |ms: u64| Timestamp(1_000_000 + ms * MS);
         let mut clock = AwakeClock::new(at(0), Duration::from_millis(40));
         assert_eq!(clock.advance(at(30), at(80)), at(30));

@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sign_of_life_is_as_old_as_the_leader_says_whoever_passes_it_on() {
+    fn life_sign_keeps_stated_age() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
         assert_eq!(
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_stood_still_is_followed_again_once_its_signs_of_life_go_on() {
+    fn resumed_leader_is_followed_again() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
         // The leader's process was suspended for two seconds, which its clock does not count.

@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn the_deadlines_of_a_silent_leader_pass_in_their_order() {
+    fn silent_leader_deadlines_are_ordered() {
         let config = ElectionConfig::default();
         for beat_interval in [config.beat(), config.near_beat(), config.idle_beat()] {
             for (has_rounds, given_up) in
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_last_round_that_all_heard_keeps_a_standby_no_longer() {
+    fn complete_last_round_frees_standby() {
         let config = ElectionConfig::default();
         let epoch = Epoch::new(1, NodeName::from_static("edge"));
         let mut leader = Following::new(

@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_survive_every_encoding_and_fit_a_packet() {
+    fn messages_round_trip_and_fit_packet() {
         let mut message = beat(4, "edge");
         let long = NodeName::new("x".repeat(64)).unwrap();
         if let Body::Beat {

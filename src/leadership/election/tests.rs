@@ -106,7 +106,7 @@ fn is_counted(effects: &[ElectionEffect]) -> bool {
 }
 
 #[test]
-fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
+fn forged_term_blocks_no_election() {
     let mut election = euclid();
     let mut hear = |seq, term| {
         let effects = election.handle(
@@ -142,7 +142,7 @@ fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
 }
 
 #[test]
-fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
+fn forged_sequence_mutes_no_node() {
     let mut election = euclid();
     let hear = |election: &mut Election, seq, term, now| {
         let status = Body::Status {
@@ -171,7 +171,7 @@ fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
 }
 
 #[test]
-fn a_node_without_a_term_joins_a_cell_of_any_age() {
+fn node_without_term_joins_any_cell() {
     let mut election = euclid_after(0);
     let old = 1_800_000_000;
     assert!(!is_counted(&election.handle(
@@ -234,7 +234,7 @@ fn succeeded_after(rounds: &[u64]) -> (u64, usize) {
 }
 
 #[test]
-fn a_forged_round_does_not_move_the_first_round_of_the_next_leader() {
+fn forged_round_moves_no_first_round() {
     assert_eq!(succeeded_after(&[88]), (89, 0));
     assert_eq!(succeeded_after(&[88, 88 + MAX_ROUND_STEP + 1]), (89, 1));
     assert_eq!(
@@ -252,7 +252,7 @@ fn a_forged_round_does_not_move_the_first_round_of_the_next_leader() {
 }
 
 #[test]
-fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
+fn follower_of_ended_leadership_is_corrected() {
     let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
     let mut now = Timestamp(1_000_000);
     let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
@@ -304,7 +304,7 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
 }
 
 #[test]
-fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
+fn earlier_message_ends_no_leadership() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
     let before = Epoch::new(1, edge.clone());
     let next = Epoch::new(2, gauss.clone());
@@ -353,7 +353,7 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
 
 /// A leader stays when another node follows a leader that has not been received.
 #[test]
-fn the_word_about_an_unknown_leader_ends_no_leadership() {
+fn unknown_leader_ends_no_leadership() {
     let mut election = euclid();
     let mut now = NOW;
     let hopper = NodeName::from_static("hopper");
@@ -394,7 +394,7 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
 /// After a split: the follower now follows the edge, which this leader has not received yet.
 /// Leading in a later term would create one more leader to outbid.
 #[test]
-fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
+fn deserted_leader_waits_for_successor() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
     let mut election = euclid();
     let mut now = NOW;
@@ -422,7 +422,7 @@ fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
 /// A leader has no followers yet when it begins. A vehicle that reports another leader at that time
 /// does not end the leadership.
 #[test]
-fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
+fn early_contradiction_ends_no_leadership() {
     let [edge, hopper] = ["edge", "hopper"].map(NodeName::from_static);
     let mut election = euclid();
     // A fit candidate that does not lead.
@@ -543,14 +543,14 @@ fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
 }
 
 #[test]
-fn a_leader_whom_all_follow_again_does_not_lead_on_in_another_term() {
+fn followed_leader_renews_no_term() {
     let time = Duration::from_secs(20);
     assert_eq!(renewals(true, time).len(), 1);
     assert!(renewals(false, time).len() > 1, "nobody follows");
 }
 
 #[test]
-fn one_that_refuses_every_term_has_a_leader_begin_another_every_ten_seconds_at_most() {
+fn refused_terms_renew_every_ten_seconds() {
     let began = renewals(false, Duration::from_secs(120));
     let pauses: Vec<_> = began
         .windows(2)
@@ -564,7 +564,7 @@ fn one_that_refuses_every_term_has_a_leader_begin_another_every_ten_seconds_at_m
 }
 
 #[test]
-fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() {
+fn hourly_term_growth_is_bounded() {
     let mut election = euclid();
     let status = || Body::Status {
         over: None,
@@ -598,7 +598,7 @@ fn claim_of_gauss(seq: u64) -> ElectionInput {
 }
 
 #[test]
-fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent() {
+fn follower_keeps_live_higher_rank_leader() {
     let mut election = euclid();
     election.handle(of_edge(1, 8, beat(1)), NOW);
     for ms in 1..1000 {
@@ -628,7 +628,7 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
 }
 
 #[test]
-fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
+fn foreign_resignation_changes_no_state() {
     let gauss = NodeName::from_static("gauss");
     let mut election = euclid();
     election.handle(of_edge(1, 8, beat(1)), NOW);
@@ -663,7 +663,7 @@ fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
 }
 
 #[test]
-fn a_liar_that_waits_for_the_end_of_the_leader_does_not_come_before_the_standby() {
+fn standby_precedes_false_claimant() {
     let config = ElectionConfig {
         priority: 120,
         ..ElectionConfig::default()
@@ -715,7 +715,7 @@ fn a_liar_that_waits_for_the_end_of_the_leader_does_not_come_before_the_standby(
 }
 
 #[test]
-fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
+fn node_leaves_false_first_leader() {
     let [hopper, noether, leader] = ["hopper", "noether", "v02"].map(NodeName::from_static);
     let mut election = euclid();
     election.handle(claim_of_gauss(1), NOW);
@@ -740,7 +740,7 @@ fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
 }
 
 #[test]
-fn a_claim_waits_no_longer_for_being_repeated() {
+fn repeated_claim_is_not_delayed() {
     let mut election = euclid();
     let mut now = NOW;
     let idle = Body::Beat {
@@ -764,7 +764,7 @@ fn a_claim_waits_no_longer_for_being_repeated() {
 
 /// One certificate is valid for several names: the node's name and the names of its parts.
 #[test]
-fn the_parts_of_a_node_depose_no_leader() {
+fn node_parts_depose_no_leader() {
     let mut election = euclid();
     let mut now = NOW;
     let gauss = NodeName::from_static("gauss");
@@ -802,7 +802,7 @@ fn the_parts_of_a_node_depose_no_leader() {
 }
 
 #[test]
-fn a_first_boot_beside_a_liar_is_no_separate_cell() {
+fn first_boot_joins_existing_cell() {
     let gauss = NodeName::from_static("gauss");
     let lie = Epoch::new(MAX_FIRST_TERM - 1, gauss.clone());
     let mut election = euclid_after(1);
@@ -826,7 +826,7 @@ fn a_first_boot_beside_a_liar_is_no_separate_cell() {
 }
 
 #[test]
-fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
+fn long_follower_refuses_lower_term() {
     let gauss = NodeName::from_static("gauss");
     let edge = NodeName::from_static("edge");
     let old = Epoch::new(1_800_000_000, edge.clone());
@@ -855,7 +855,7 @@ fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
 /// other. Whoever passes another node's question on must still ask for itself: without a question
 /// of its own it would wait for the claims of nodes on the other side.
 #[test]
-fn questions_of_other_nodes_do_not_delay_the_own_question() {
+fn relayed_question_replaces_no_local() {
     let edge = NodeName::from_static("edge");
     let gauss = NodeName::from_static("gauss");
     let epoch = epoch_of_edge();

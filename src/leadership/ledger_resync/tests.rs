@@ -171,7 +171,7 @@ fn slander(epoch: u64, aggregator: &str, incorrect: u64) -> LedgerEntry {
 }
 
 #[test]
-fn evidence_of_vehicles_strangers_and_later_terms_is_refused() {
+fn unauthorised_evidence_is_refused() {
     let mut euclid = euclid();
     for stranger in ["mallory", "stranger"] {
         let refused = euclid.merge(&share(stranger, None, vec![slander(7, stranger, 1000)]), 0);
@@ -193,7 +193,7 @@ fn evidence_of_vehicles_strangers_and_later_terms_is_refused() {
 }
 
 #[test]
-fn only_the_leader_tells_what_it_counts_while_it_leads() {
+fn only_leader_shares_current_counts() {
     let mut euclid = euclid();
     euclid
         .merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0)
@@ -215,7 +215,7 @@ fn only_the_leader_tells_what_it_counts_while_it_leads() {
 }
 
 #[test]
-fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
+fn current_counts_cannot_jump() {
     let mut euclid = euclid();
     euclid
         .merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0)
@@ -249,7 +249,7 @@ fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
 }
 
 #[test]
-fn nobody_writes_in_the_lane_of_a_node_that_leads() {
+fn leading_nodes_lane_is_protected() {
     let mut euclid = euclid();
     euclid.lead(7);
     euclid
@@ -259,7 +259,7 @@ fn nobody_writes_in_the_lane_of_a_node_that_leads() {
 }
 
 #[test]
-fn a_candidate_that_invents_lanes_does_not_displace_the_leaders() {
+fn invented_lanes_displace_no_leader() {
     let mut euclid = euclid();
     let forged = (0..2 * MAX_LANES)
         .map(|n| slander(7, &format!("forger{n:03}"), 0))
@@ -272,7 +272,7 @@ fn a_candidate_that_invents_lanes_does_not_displace_the_leaders() {
 }
 
 #[test]
-fn leaders_that_change_with_every_share_are_not_answered_each_time() {
+fn alternating_leaders_get_few_answers() {
     let mut euclid = euclid();
     let mut sent = Vec::new();
     for at_ms in 0..1000 {
@@ -309,7 +309,7 @@ fn leaders_that_change_with_every_share_are_not_answered_each_time() {
 }
 
 #[test]
-fn a_candidate_that_says_it_leads_does_not_have_others_send_all_evidence() {
+fn claimed_lead_triggers_no_transfer() {
     let mut euclid = euclid();
     assert_eq!(
         euclid
@@ -341,7 +341,7 @@ fn a_candidate_that_says_it_leads_does_not_have_others_send_all_evidence() {
 }
 
 #[test]
-fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains() {
+fn dead_leaders_evidence_survives_split() {
     let mut a = Candidate::new("a");
     let mut b1 = Candidate::new("b1");
     let mut b2 = Candidate::new("b2");
@@ -363,7 +363,7 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
 }
 
 #[test]
-fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
+fn followers_evidence_reaches_next_leader() {
     let mut a = Candidate::new("a");
     let mut b1 = Candidate::new("b1");
     let mut b2 = Candidate::new("b2");
@@ -381,7 +381,7 @@ fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
 }
 
 #[test]
-fn a_candidate_that_never_led_is_silent_when_it_hears_a_leader() {
+fn candidate_without_counts_stays_silent() {
     let mut leader = Candidate::new("leader");
     let mut other = Candidate::new("other");
     leader.lead(1);
@@ -392,7 +392,7 @@ fn a_candidate_that_never_led_is_silent_when_it_hears_a_leader() {
 }
 
 #[test]
-fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
+fn round_counts_are_shared_at_once() {
     let mut leader = Candidate::new("leader");
     leader.lead(1);
     let [empty] = &leader.resync.snapshot(&leader.ledger)[..] else {
@@ -406,7 +406,7 @@ fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
 }
 
 #[test]
-fn a_leader_that_has_counted_much_is_believed_in_its_next_rounds() {
+fn many_counts_stay_acceptable() {
     let mut edge = signing("edge", 7, "edge");
     let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
@@ -449,7 +449,7 @@ fn sign(shares: Vec<LedgerShare>) -> Vec<LedgerShare> {
 }
 
 #[test]
-fn evidence_without_a_signature_is_refused_where_all_sign() {
+fn unsigned_evidence_is_refused() {
     let mut euclid = signing("euclid", 7, "edge");
     let honest = share("edge", Some(7), vec![slander(7, "edge", 1)]);
     assert_eq!(euclid.merge(&honest, 0), Err(RejectReason::BadSignature));
@@ -485,7 +485,7 @@ fn evidence_without_a_signature_is_refused_where_all_sign() {
 }
 
 #[test]
-fn what_was_signed_together_is_taken_together() {
+fn signed_entries_are_accepted_together() {
     let mut euclid = signing("euclid", 7, "edge");
     let slanders = vec![
         slander(7, "edge", 1),
@@ -511,7 +511,7 @@ fn what_was_signed_together_is_taken_together() {
 }
 
 #[test]
-fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
+fn invented_lane_has_no_effect() {
     let mut edge = signing("edge", 7, "edge");
     let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
@@ -557,7 +557,7 @@ fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
 }
 
 #[test]
-fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificate() {
+fn dead_leaders_signature_is_relayed() {
     let mut euclid = signing("other", 7, "edge");
     let mut gauss = signing("gauss", 8, "leader");
     let mut edge = signing("edge", 7, "edge");
@@ -597,7 +597,7 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
 }
 
 #[test]
-fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_again() {
+fn lost_counts_are_recovered() {
     let mut edge = signing("edge", 8, "leader");
     let mut before = signing("edge", 7, "edge");
     before.lead(7);
@@ -621,7 +621,7 @@ fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_ag
 }
 
 #[test]
-fn statements_that_later_ones_replace_are_dropped() {
+fn superseded_statements_are_dropped() {
     let mut edge = signing("edge", 7, "edge");
     let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
@@ -647,7 +647,7 @@ fn statements_that_later_ones_replace_are_dropped() {
 }
 
 #[test]
-fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back() {
+fn reset_empties_all_ledgers() {
     let mut leader = Candidate::new("leader");
     let mut euclid = Candidate::new("other");
     leader.lead(7);
@@ -689,7 +689,7 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
 /// Two sides of a split have counted votes. The side that continues to lead must not place its
 /// counts before the other side's votes.
 #[test]
-fn the_votes_after_a_heal_are_the_latest() {
+fn votes_after_merge_are_latest() {
     let config = ReputationConfig::default();
     let mut edge = Candidate::new("edge");
     let vote = |correct| Evidence {
@@ -716,7 +716,7 @@ fn the_votes_after_a_heal_are_the_latest() {
 /// A follower that claims a higher term makes the leader renew its own: that costs no older
 /// evidence.
 #[test]
-fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
+fn renewed_term_keeps_one_lane() {
     let mut edge = Candidate::new("edge");
     let mut gauss = Candidate::new("gauss");
     for candidate in [&mut edge, &mut gauss] {

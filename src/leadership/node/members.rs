@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_a_broker_is_understood_for_a_while_after_its_node_was_given_up() {
+    fn removed_brokers_end_is_recognised() {
         let mut members = Members::default();
         let edge = member("edge", 1);
         let broker = "10.0.0.1:1".parse().unwrap();
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_membership_started_anew_has_time_to_find_everyone_again() {
+    fn restarted_membership_has_grace() {
         let mut members = Members::default();
         members.place(member("edge", 1));
         members.place(member("gauss", 2));

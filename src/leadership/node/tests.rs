@@ -221,7 +221,7 @@ fn member(node: &str, host: u8) -> SeenMember {
 }
 
 #[test]
-fn a_leadership_is_shown_before_it_is_carried_out_and_its_term_goes_to_disk_before_both() {
+fn term_is_persisted_before_leading() {
     let mut scene = Scene::new(Role::Auto, None);
     scene.run_for(1300);
     let leads = |effect: &Effect| matches!(effect, Effect::TellLeadership { leadership } if leadership.is_leading());
@@ -236,7 +236,7 @@ fn a_leadership_is_shown_before_it_is_carried_out_and_its_term_goes_to_disk_befo
 }
 
 #[test]
-fn a_link_that_was_up_and_is_refused_ends_its_leader_at_once() {
+fn refused_link_ends_its_leader() {
     let mut scene = Scene::standing_by();
     scene.take(Input::LinkChanged {
         broker: broker(2).into(),
@@ -255,7 +255,7 @@ fn a_link_that_was_up_and_is_refused_ends_its_leader_at_once() {
 }
 
 #[test]
-fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
+fn last_will_ends_leader() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
     scene.take(Input::LinkChanged {
         broker: "10.0.0.9:1883".parse().unwrap(),
@@ -302,7 +302,7 @@ fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
 
 /// Any member can forge the broker's report that the leader's connection broke.
 #[test]
-fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
+fn false_will_ends_run_once() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
     scene.take(Input::LinkChanged {
         broker: "10.0.0.9:1883".parse().unwrap(),
@@ -349,7 +349,7 @@ fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
 }
 
 #[test]
-fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
+fn handover_waits_bounded_for_evidence() {
     for (evidence_at, ready_at) in [(Some(0), 300), (Some(420), 450), (None, 1000)] {
         let mut scene = Scene::standing_by();
         scene.hear(Body::Offer);
@@ -428,7 +428,7 @@ fn is_yield(effect: &Effect) -> bool {
 }
 
 #[test]
-fn a_round_is_held_before_the_word_that_yields_the_next() {
+fn round_is_held_before_yielding() {
     let scene = leading_beside_a_ready_challenger(None, Some(broker(2)));
     let yielded = scene
         .position_of(is_yield)
@@ -439,7 +439,7 @@ fn a_round_is_held_before_the_word_that_yields_the_next() {
 }
 
 #[test]
-fn rounds_are_held_for_a_whole_round_before_the_lead_is_yielded() {
+fn rounds_are_held_whole_before_yielding() {
     // A round that ends early right after the yielded one would be published by both leaders.
     let scene = leading_beside_a_ready_challenger(None, Some(broker(2)));
     let yielded = scene.position_of(is_yield).unwrap();
@@ -454,7 +454,7 @@ fn rounds_are_held_for_a_whole_round_before_the_lead_is_yielded() {
 }
 
 #[test]
-fn the_lead_is_yielded_right_after_a_round_also_if_rounds_are_slow() {
+fn lead_is_yielded_after_round() {
     const ROUND_MS: u64 = 700;
     let mut scene = leading_with_external_broker(None);
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
@@ -478,7 +478,7 @@ fn the_lead_is_yielded_right_after_a_round_also_if_rounds_are_slow() {
 }
 
 #[test]
-fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
+fn no_handover_to_refusing_broker() {
     // An external broker that is down does not serve the challenger either.
     for external in [None, Some(broker(9))] {
         let scene = leading_beside_a_ready_challenger(external, None);
@@ -496,7 +496,7 @@ fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
 }
 
 #[test]
-fn the_lead_is_not_handed_to_a_node_in_whose_place_another_broker_is() {
+fn no_handover_to_replaced_broker() {
     let scene = leading_beside(None, Some(broker(2)), "gauss");
     assert_eq!(scene.position_of(is_yield), None);
     assert!(scene.notices().contains(&&Notice::NotServed {
@@ -508,7 +508,7 @@ fn the_lead_is_not_handed_to_a_node_in_whose_place_another_broker_is() {
 }
 
 #[test]
-fn a_late_wake_up_lets_waiting_messages_speak_first() {
+fn late_wake_up_processes_messages_first() {
     let mut scene = Scene::standing_by();
     let due = scene.machine.next_deadline();
     scene.now = due + Duration::from_millis(300);
@@ -523,7 +523,7 @@ fn a_late_wake_up_lets_waiting_messages_speak_first() {
 }
 
 #[test]
-fn a_gateway_started_anew_is_told_links_and_status_again() {
+fn restarted_gateway_receives_links_and_status() {
     let mut scene = Scene::standing_by();
     scene.take(Input::GatewayRestarted);
     let [links] = &scene
@@ -553,7 +553,7 @@ fn a_gateway_started_anew_is_told_links_and_status_again() {
 }
 
 #[test]
-fn a_vehicle_asks_no_parts_and_never_says_that_it_is_fit() {
+fn vehicle_declares_no_fitness() {
     let mut scene = Scene::new(Role::Cav, None);
     for _ in 0..8 {
         scene.now = scene.now + HEALTH_PERIOD;
@@ -576,7 +576,7 @@ fn a_vehicle_asks_no_parts_and_never_says_that_it_is_fit() {
 }
 
 #[test]
-fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
+fn unreachable_node_is_unfit_once() {
     let mut scene = Scene::new(Role::Auto, None);
     scene.take(Input::OwnBroker {
         address: Some(SocketAddr::from(([127, 0, 0, 1], 1883))),
@@ -597,7 +597,7 @@ fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
 }
 
 #[test]
-fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
+fn rebooted_machine_avoids_earlier_term() {
     let epoch = Some(Epoch::new(9, name("euclid")));
     let before = Leadership {
         position: Position::Leading,
@@ -635,7 +635,7 @@ fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
 }
 
 #[test]
-fn a_message_in_anothers_name_is_dropped() {
+fn foreign_sender_is_dropped() {
     let mut scene = Scene::standing_by();
     let mut before = scene.machine.clone();
     let ended = Epoch::new(7, name("edge"));
@@ -695,7 +695,7 @@ fn is_followed(rights: Rights) -> bool {
 }
 
 #[test]
-fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
+fn unauthorised_beat_is_not_followed() {
     assert!(is_followed(Rights::ALL));
     assert!(is_followed(Rights {
         priority: 100,
@@ -713,7 +713,7 @@ fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
 
 /// An observer has no rights, and the priority that nodes have by default.
 #[test]
-fn who_only_follows_declares_nothing_by_its_priority() {
+fn follower_priority_declares_no_role() {
     let mut scene = Scene::new(Role::Auto, None);
     let mut message = scene.message(
         Epoch::new(7, name("edge")),
@@ -742,7 +742,7 @@ fn who_only_follows_declares_nothing_by_its_priority() {
 
 /// Vehicles and observers are asked for the leader's last sign of life, as all nodes are.
 #[test]
-fn a_follower_without_rights_that_vouches_for_its_leader_declares_nothing() {
+fn vouching_follower_declares_no_role() {
     let mut scene = Scene::new(Role::Auto, None);
     let body = Body::LeaderEvidence {
         ask: 1,
@@ -764,7 +764,7 @@ fn a_follower_without_rights_that_vouches_for_its_leader_declares_nothing() {
 
 /// A leader hands leadership over to an `edge`, but not to a node that merely claims that role.
 #[test]
-fn a_declared_role_beyond_the_certificate_takes_no_lead() {
+fn excess_role_takes_no_lead() {
     for (role, is_offered) in [(Role::Edge, true), (Role::Auto, false)] {
         let mut scene = Scene::new(Role::Auto, None);
         scene.take(Input::OwnBroker {

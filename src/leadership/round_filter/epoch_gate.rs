@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gate_refuses_old_epochs_and_repeated_rounds() {
+    fn old_or_repeated_rounds_refused() {
         let mut gate = EpochGate::default();
         assert_eq!(gate.admit(&epoch(3, "edge"), 88), Ok(()));
         assert_eq!(
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restarted_node_refuses_terms_below_the_persisted_one() {
+    fn terms_below_persisted_are_refused() {
         let mut gate = EpochGate::new(7);
         assert_eq!(
             gate.admit(&epoch(6, "edge"), 500),

@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_round_over_another_nodes_broker_needs_a_signature() {
+    fn foreign_broker_round_needs_signature() {
         use SignatureState::{Invalid, Unverifiable, Valid};
 
         let [edge, euclid] = ["edge", "euclid"].map(NodeName::from_static);

@@ -64,7 +64,7 @@ mod tests {
     use crate::model::epoch::Epoch;
 
     #[test]
-    fn the_leader_publishes_and_the_one_before_says_farewell() {
+    fn only_leader_and_predecessor_publish() {
         let led_by = |leader: &str| Leadership {
             position: Position::Following,
             epoch: Some(Epoch::new(1, NodeName::new(leader).unwrap())),

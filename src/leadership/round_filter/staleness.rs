@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_that_waited_are_old_whatever_the_leaders_clock_says() {
+    fn delayed_rounds_are_old() {
         for ahead in [0, 3_600_000] {
             let epoch = Epoch::new(3, NodeName::from_static("edge"));
             let mut filter = StalenessFilter::new(ms(0));
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_leadership_has_a_clock_of_its_own() {
+    fn each_leadership_has_separate_clock() {
         let mut filter = StalenessFilter::new(ms(60_000));
         assert!(filter.is_fresh(
             &Epoch::new(3, NodeName::from_static("edge")),
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn leaders_that_alternate_make_no_old_round_fresh() {
+    fn alternating_leaders_refresh_no_old_round() {
         let leaders = ["edge", "gauss"].map(NodeName::from_static);
         let epoch = |n: u64| Epoch::new(n / 3, leaders[(n / 3 % 2) as usize].clone());
         let mut filter = StalenessFilter::new(ms(0));
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_leads_again_with_another_clock_is_believed_at_once() {
+    fn returning_leader_may_change_clock() {
         let leaders = ["edge", "gauss"].map(NodeName::from_static);
         let epoch = |term: u64| Epoch::new(term, leaders[(term % 2) as usize].clone());
         let mut filter = StalenessFilter::new(ms(0));
@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
+    fn missed_leadership_needs_fresh_rounds() {
         let edge = Epoch::new(3, NodeName::from_static("edge"));
         let gauss = Epoch::new(4, NodeName::from_static("gauss"));
         let mut filter = StalenessFilter::new(ms(0));
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_whose_clock_was_set_is_believed_at_once() {
+    fn leader_with_changed_clock_is_accepted() {
         for step_ms in [5_000, -5_000, -31_536_000_000_i64] {
             let epoch = Epoch::new(3, NodeName::from_static("edge"));
             let mut filter = StalenessFilter::new(ms(0));
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_that_waited_are_old_though_the_leaders_clock_was_set_back_meanwhile() {
+    fn backward_clock_hides_no_delay() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut filter = StalenessFilter::new(ms(0));
         let made = |n: u64| ms(100 * n).shifted(if n < 30 { 0 } else { -5_000_000 });
@@ -285,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_stopped_as_it_starts_takes_only_what_is_made_now() {
+    fn stop_at_start_needs_fresh_rounds() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut filter = StalenessFilter::new(ms(0));
         assert!((1..30).all(|n| !filter.is_fresh(&epoch, ms(100 * n), ms(3000))));
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_way_that_became_longer_is_believed_in_the_end() {
+    fn longer_path_is_accepted_eventually() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut filter = StalenessFilter::new(ms(0));
         let is_fresh = |n: u64, filter: &mut StalenessFilter| {
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_back_makes_no_older_rounds_fresh() {
+    fn backward_clock_refreshes_no_old_rounds() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut filter = StalenessFilter::new(ms(0));
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
@@ -334,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_go_on_after_a_silence_in_which_the_leaders_clock_was_set_back() {
+    fn rounds_continue_after_silent_clock_change() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut filter = StalenessFilter::new(ms(0));
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_runs_for_a_moment_between_two_stops_learns_no_delay_from_them() {
+    fn short_run_between_stops_keeps_delay() {
         let old = NodeName::from_static("euclid");
         let new = NodeName::from_static("edge");
         let old = Epoch::new(1, old);

@@ -320,7 +320,7 @@ mod tests {
     /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival
     /// changes them.
     #[test]
-    fn a_retained_message_may_be_much_older_than_the_next_and_no_other_may() {
+    fn only_retained_message_may_be_older() {
         let elected = epoch(7, "edge");
         let leadership = led_by(elected.clone(), None);
         let mut filter = SuccessionFilter::of_retained(0);
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_forged_epoch_does_not_silence_the_elected() {
+    fn forged_epoch_silences_no_leader() {
         let elected = epoch(7, "edge");
         let forged = epoch(u64::MAX, "gauss");
         let leadership = led_by(elected.clone(), Some("euclid"));
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
+    fn false_successor_passes_once() {
         let elected = epoch(7, "edge");
         let forged = epoch(u64::MAX, "euclid");
         let leadership = led_by(elected.clone(), Some("euclid"));
@@ -377,7 +377,7 @@ mod tests {
 
     /// Each claim of a later term makes the leader renew its own.
     #[test]
-    fn one_that_poses_as_the_next_leader_is_not_believed_again_when_the_leader_renews_its_term() {
+    fn renewal_readmits_no_false_successor() {
         let forged = |term| epoch(term + 1, "euclid");
         let mut filter = SuccessionFilter::new(0);
         let mut lost = Vec::new();
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn the_next_leader_is_taken_before_word_of_its_election_came() {
+    fn successor_precedes_election_message() {
         let old = epoch(7, "edge");
         let new = epoch(8, "euclid");
         let mut filter = SuccessionFilter::of_retained(0);
@@ -440,7 +440,7 @@ mod tests {
     /// The standby took over while the leader was cut off. The standby's rounds arrive before the
     /// election's messages do.
     #[test]
-    fn a_leader_takes_no_round_of_another_beside_its_own_before_it_yields() {
+    fn unyielding_leader_refuses_other_rounds() {
         let own = epoch(7, "edge");
         let next = epoch(8, "euclid");
         let leading = Leadership {
@@ -465,7 +465,7 @@ mod tests {
     }
 
     #[test]
-    fn a_forged_round_of_the_elected_epoch_does_not_silence_it() {
+    fn forged_round_silences_no_leader() {
         let edge = epoch(7, "edge");
         let leadership = led_by(epoch(7, "edge"), Some("euclid"));
         let mut filter = SuccessionFilter::new(0);
@@ -489,7 +489,7 @@ mod tests {
     }
 
     #[test]
-    fn the_elected_goes_on_in_a_later_term_before_word_of_it_came() {
+    fn renewed_term_precedes_message() {
         let before = epoch(7, "edge");
         let renewed = epoch(8, "edge");
         let leadership = led_by(before.clone(), Some("euclid"));
@@ -503,7 +503,7 @@ mod tests {
     }
 
     #[test]
-    fn a_saved_term_does_not_shut_out_for_good_who_publishes_without_any_election() {
+    fn saved_term_admits_unelected_publisher_later() {
         let unelected = epoch(3, "aggregator");
         let leadership = seeking(50);
         let mut filter = SuccessionFilter::new(50);
@@ -520,7 +520,7 @@ mod tests {
     }
 
     #[test]
-    fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
+    fn separately_leading_standby_is_no_successor() {
         let elected = epoch(2, "euclid");
         let lone = epoch(3, "edge");
         let leadership = led_by(elected.clone(), Some("edge"));
@@ -545,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn who_began_to_lead_at_the_same_time_as_the_elected_waits_for_its_silence() {
+    fn simultaneous_rival_waits_for_silence() {
         let elected = epoch(1, "edge");
         let rival = epoch(1, "v02");
         for standby in [None, Some("v02")] {
@@ -577,7 +577,7 @@ mod tests {
     }
 
     #[test]
-    fn who_was_taken_before_the_elected_was_known_is_taken_until_the_elected_is_heard() {
+    fn earlier_rival_lasts_until_elected_publishes() {
         let elected = epoch(1, "edge");
         let rival = epoch(1, "v02");
         let renewed = epoch(2, "edge");
@@ -606,7 +606,7 @@ mod tests {
     }
 
     #[test]
-    fn the_elected_is_heard_half_a_second_after_a_later_one_that_said_one_word_only() {
+    fn single_later_round_silences_briefly() {
         let elected = epoch(6, "euclid");
         let later = epoch(6, "gauss");
         let mut filter = SuccessionFilter::new(0);
@@ -624,7 +624,7 @@ mod tests {
     }
 
     #[test]
-    fn while_nobody_leads_an_unknown_term_is_believed_only_of_one_who_goes_on_publishing() {
+    fn unknown_term_needs_steady_publisher() {
         let seeking_in_7 = seeking(7);
         let mut filter = SuccessionFilter::new(0);
         let next = epoch(8, "edge");
@@ -657,7 +657,7 @@ mod tests {
     }
 
     #[test]
-    fn who_publishes_without_any_election_is_believed_however_seldom() {
+    fn slow_unelected_publisher_is_accepted() {
         for (period_ms, believed_from) in [(100, 5), (1000, 1), (5000, 1)] {
             let mut filter = SuccessionFilter::new(0);
             for term in [3, 1_763_683_200] {
@@ -684,7 +684,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
+    fn last_old_round_passes_before_new() {
         let old = epoch(7, "edge");
         let new = epoch(8, "euclid");
         let mut filter = SuccessionFilter::of_retained(0);

@@ -148,7 +148,7 @@ fn apart_m(one: &GeographicPosition, other: &GeographicPosition) -> f64 {
 }
 
 #[test]
-fn positions_within_five_kilometres_are_those_of_proj() {
+fn positions_match_proj() {
     for ([latitude, longitude, height], [x, y, z], by_proj) in BY_PROJ {
         let origin = at(latitude, longitude, height);
         let by_proj = position(by_proj);
@@ -173,7 +173,7 @@ fn positions_within_five_kilometres_are_those_of_proj() {
 }
 
 #[test]
-fn the_ground_falls_two_metres_below_the_plane_at_five_kilometres_and_its_distances_are_kept() {
+fn curvature_keeps_ground_distances() {
     let origin = at(52.2296756, 21.0122287, 0.0);
     // 5 km along a geodesic to the north-east, by PROJ.
     let on_ground = position([52.26143804141, 21.06401074718, 0.0]);
@@ -195,7 +195,7 @@ fn the_ground_falls_two_metres_below_the_plane_at_five_kilometres_and_its_distan
 }
 
 #[test]
-fn a_heading_is_clockwise_from_the_north_of_where_the_vehicle_is() {
+fn heading_is_clockwise_from_local_north() {
     let origin = at(52.2, 21.0, 100.0);
     for (azimuth_deg, heading_deg) in [
         (0.0, 90.0),
@@ -236,7 +236,7 @@ fn a_heading_is_clockwise_from_the_north_of_where_the_vehicle_is() {
 }
 
 #[test]
-fn without_a_height_the_vehicle_is_at_that_of_the_origin() {
+fn missing_height_uses_origin_height() {
     let origin = at(46.5, 8.0, 2000.0);
     let stated = pose(46.54, 8.0, 0.0);
     let level = origin.pose_to_map(&stated).unwrap();
@@ -257,7 +257,7 @@ fn without_a_height_the_vehicle_is_at_that_of_the_origin() {
 }
 
 #[test]
-fn a_pose_on_earth_needs_an_origin_that_is_near() {
+fn earth_pose_needs_near_origin() {
     let warsaw = at(52.2296756, 21.0122287, 113.0);
     let in_map = StatedPose::InMap(Pose::new(1.0, 2.0, 3.0));
     assert_eq!(
@@ -283,7 +283,7 @@ fn a_pose_on_earth_needs_an_origin_that_is_near() {
 proptest! {
     /// Anywhere, also at the poles and the date line.
     #[test]
-    fn there_and_back_is_the_same_place(
+    fn conversion_round_trips(
         (latitude, longitude, height) in (-90.0..=90.0, -180.0..=180.0, -400.0..9000.0),
         (rotation_deg, x, y, z) in (-360.0..360.0, -1e5..1e5, -1e5..1e5, -500.0..500.0),
     ) {
@@ -295,7 +295,7 @@ proptest! {
 }
 
 #[test]
-fn a_compass_heading_is_clockwise_from_true_north_also_in_a_rotated_frame() {
+fn compass_heading_uses_true_north() {
     let south = StatedPose::ByCompass(Point2::new(1.0, 6.0), 180.0);
     let rotated = GeographicOrigin {
         rotation_deg: 30.0,

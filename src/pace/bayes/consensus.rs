@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_label_that_is_no_longer_believed_gives_way_to_one_that_is() {
+    fn outweighed_label_is_replaced() {
         let car = Label::from("car");
         let van = Label::from("van");
         let winner = |nats_of_car: f64| {

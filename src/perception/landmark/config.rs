@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_that_no_receiver_would_take_are_refused() {
+    fn invalid_texts_are_refused() {
         let place = LandmarkConfig::at("slot-0", 0.0, 0.0);
         assert_eq!(place.validate(), Ok(()));
         let sign = |label: &str| {

@@ -65,7 +65,7 @@ fn offset_m(object: &PerceivedObject, expected: Point2<f64>) -> f64 {
 
 proptest! {
     #[test]
-    fn every_pinhole_ranging_returns_to_the_point_that_was_projected(
+    fn pinhole_ranging_inverts_projection(
         pose in poses(), range_m in 0.2..3.0, bearing_rad in -0.4..0.4f64,
     ) {
         let expected = pose.transform(range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
@@ -81,7 +81,7 @@ proptest! {
     }
 
     #[test]
-    fn paper_ranging_is_the_published_algorithm(pose in poses(), x_min in 0.0..500.0f64, w in 1.0..130.0f64) {
+    fn paper_ranging_matches_publication(pose in poses(), x_min in 0.0..500.0f64, w in 1.0..130.0f64) {
         let seen = detection(BoundingBox { x_min, y_min: 100.0, x_max: x_min + w, y_max: 150.0 });
         let placed = projection(Ranging::Paper).place(&seen, Cut::default(), None, &pose).unwrap();
 
@@ -99,7 +99,7 @@ proptest! {
     }
 
     #[test]
-    fn positions_and_covariances_move_and_turn_with_the_camera(
+    fn positions_and_covariances_follow_camera(
         pose in poses(), range_m in 0.2..3.0, bearing_rad in -0.4..0.4f64, turn_rad in -4.0..4.0f64, shift in -9.0..9.0f64,
     ) {
         let seen = detection(board(range_m, bearing_rad, 0.3));
@@ -117,7 +117,7 @@ proptest! {
     }
 
     #[test]
-    fn whatever_the_box_the_result_is_an_error_or_a_finite_position_with_a_positive_covariance(
+    fn any_box_gives_error_or_position(
         edges in proptest::array::uniform4(prop_oneof![
             -1e3..1e3f64, Just(f64::NAN), Just(f64::INFINITY), Just(0.0), Just(1e-320), Just(1e300),
         ]),
@@ -135,7 +135,7 @@ proptest! {
 }
 
 #[test]
-fn yaw_leaves_the_range_by_height_alone_and_stretches_the_range_by_width() {
+fn yaw_stretches_width_range_only() {
     let seen = detection(board(0.5, 0.0, 60f64.to_radians()));
     let range = |ranging| {
         projection(ranging)
@@ -156,7 +156,7 @@ fn yaw_leaves_the_range_by_height_alone_and_stretches_the_range_by_width() {
 }
 
 #[test]
-fn paper_ranging_turns_an_object_on_the_axis_half_a_field_of_view_clockwise() {
+fn paper_ranging_offset_is_half_view() {
     let placed = projection(Ranging::Paper).place(
         &detection(board(0.5, 0.0, 0.0)),
         Cut::default(),
@@ -168,7 +168,7 @@ fn paper_ranging_turns_an_object_on_the_axis_half_a_field_of_view_clockwise() {
 }
 
 #[test]
-fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
+fn uncertainty_grows_with_distance() {
     let at = |range_m| {
         let placed = projection(Ranging::BoxHeight).place(
             &detection(board(range_m, 0.0, 0.0)),
@@ -207,7 +207,7 @@ fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
 }
 
 #[test]
-fn each_unusable_detection_has_its_reason() {
+fn unusable_detections_have_reasons() {
     let origin = Pose::new(0.0, 0.0, 0.0);
     let reason = |projection: &Projection, seen: &Detection, target: Option<Point3<f64>>| {
         projection
@@ -253,7 +253,7 @@ fn each_unusable_detection_has_its_reason() {
 }
 
 #[test]
-fn labels_of_coco_have_usual_sizes_unless_a_size_is_configured() {
+fn coco_labels_have_default_sizes() {
     let usual = ObjectSizes::default();
     let person = usual.of("person").unwrap();
     assert!(
@@ -269,7 +269,7 @@ fn labels_of_coco_have_usual_sizes_unless_a_size_is_configured() {
 }
 
 #[test]
-fn listed_sizes_win_over_the_default_and_are_checked() {
+fn listed_sizes_override_checked_default() {
     let text = r#"{"default": {"width_m": 0.05, "height_m": 0.05}, "labels": {"cup": {"width_m": 0.08, "height_m": 0.1}}}"#;
     let mut sizes: ObjectSizes = serde_json::from_str(text).unwrap();
     assert_eq!(sizes.of("cup").map(|s| s.height_m), Some(0.1));

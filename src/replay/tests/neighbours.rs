@@ -43,7 +43,7 @@ fn neighbours(ms: u64) -> Arc<[NeighbourObject]> {
 }
 
 #[test]
-fn a_journal_gives_the_same_maps_with_objects_of_neighbours_and_objects_that_came_over() {
+fn neighbour_objects_replay_exactly() {
     let fusion = FusionConfig {
         algorithms: Algorithms::Pace,
         ..FusionConfig::default()

@@ -81,7 +81,7 @@ impl Scene {
 }
 
 #[test]
-fn what_one_alone_states_is_no_fact_where_several_look_and_see_nothing() {
+fn sole_claim_is_denied() {
     for honest in [2, 3, 4, 8] {
         for is_view_stated in [true, false] {
             let scene = Scene {
@@ -112,7 +112,7 @@ fn what_one_alone_states_is_no_fact_where_several_look_and_see_nothing() {
 }
 
 #[test]
-fn what_one_alone_states_is_published_where_no_other_looks() {
+fn unobserved_sole_claim_is_published() {
     let elsewhere = Scene {
         apart_m: 500.0,
         is_seen: |_, vehicle| vehicle == 0,
@@ -131,7 +131,7 @@ fn what_one_alone_states_is_published_where_no_other_looks() {
 }
 
 #[test]
-fn who_reads_an_object_in_a_third_of_its_frames_does_not_deny_it() {
+fn rare_detections_are_no_denial() {
     let scene = Scene {
         is_seen: |frame, vehicle| vehicle == 0 && frame % 3 == 0,
         ..Scene::of(3)

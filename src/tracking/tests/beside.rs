@@ -7,7 +7,7 @@ fn person(x_m: f64, y_m: f64) -> PerceivedObject {
 }
 
 #[test]
-fn two_people_side_by_side_stay_two_though_one_is_overlooked_at_times() {
+fn two_adjacent_people_stay_two() {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();
@@ -31,7 +31,7 @@ fn two_people_side_by_side_stay_two_though_one_is_overlooked_at_times() {
 }
 
 #[test]
-fn a_person_at_the_door_of_a_vehicle_is_not_taken_for_it() {
+fn person_at_vehicle_stays_separate() {
     let mut tracker = tracker();
     for frame in 0..40 {
         let pose = Some(WirePose::new(0.0, 0.0, 0.0));
@@ -66,7 +66,7 @@ fn a_person_at_the_door_of_a_vehicle_is_not_taken_for_it() {
 
 /// Beside a parked car that others see, a vehicle appears whose own body nobody has seen yet.
 #[test]
-fn a_vehicle_that_comes_up_beside_a_person_does_not_carry_it_away() {
+fn arriving_vehicle_absorbs_no_person() {
     let mut tracker = tracker();
     let mut of_person = BTreeSet::new();
     for frame in 0..40 {
@@ -94,7 +94,7 @@ fn a_vehicle_that_comes_up_beside_a_person_does_not_carry_it_away() {
 
 /// Behind a row of trucks that `hidden` sees, others see people.
 #[test]
-fn nobody_is_blamed_for_what_is_hidden_behind_what_it_sees() {
+fn occluded_objects_count_no_misses() {
     let mut tracker = tracker();
     let mut wrong = 0;
     for frame in 0..150 {

@@ -103,7 +103,7 @@ fn people_keep_their_identities() {
 }
 
 #[test]
-fn misses_and_ghosts_cost_few_identities() {
+fn misses_and_ghosts_cost_little() {
     let Crowd {
         published,
         switches,
@@ -117,7 +117,7 @@ fn misses_and_ghosts_cost_few_identities() {
 
 /// A person goes behind a wall for five seconds.
 #[test]
-fn person_out_of_sight_keeps_its_identity() {
+fn person_out_of_sight_keeps_identity() {
     let mut tracker = tracker();
     let mut seen = |frames: std::ops::Range<u64>, is_visible: bool| {
         let mut last = TracksRound::default();

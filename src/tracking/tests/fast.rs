@@ -61,7 +61,7 @@ fn highway(stamped_late_us: u64) -> Vector2<f64> {
 }
 
 #[test]
-fn poses_that_are_corrected_do_not_carry_the_map_away_as_vehicles_drive() {
+fn pose_correction_shifts_no_map() {
     for late_us in [0, 30_000] {
         let off = highway(late_us);
         assert!(
@@ -72,7 +72,7 @@ fn poses_that_are_corrected_do_not_carry_the_map_away_as_vehicles_drive() {
 }
 
 #[test]
-fn what_comes_the_other_way_in_a_frame_that_moves_is_one_object_with_a_velocity() {
+fn oncoming_object_has_one_velocity() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..10 {
@@ -92,7 +92,7 @@ fn what_comes_the_other_way_in_a_frame_that_moves_is_one_object_with_a_velocity(
 }
 
 #[test]
-fn a_car_that_all_have_seen_for_long_is_still_there_a_moment_later() {
+fn established_car_survives_short_gap() {
     let mut tracker = tracker();
     two_cars(&mut tracker, 0..30, |_| true);
     for (after, least) in [(30, 0.9), (31, 0.85), (34, 0.7)] {
@@ -109,7 +109,7 @@ fn a_car_that_all_have_seen_for_long_is_still_there_a_moment_later() {
 }
 
 #[test]
-fn a_glimpse_of_something_far_away_widens_no_view() {
+fn distant_glimpse_widens_no_view() {
     let mut coverage = Coverage::default();
     let mut objects: Vec<_> = (0..20).map(|n| car(f64::from(n), 0.0)).collect();
     assert!(!coverage.observe(&report("euclid", 0, objects.clone())));
@@ -189,7 +189,7 @@ fn error_in_a_frame_that_turns(yaw_rate_radps: f64) -> f64 {
 }
 
 #[test]
-fn a_frame_may_turn_with_its_vehicle() {
+fn frame_may_rotate_with_vehicle() {
     let straight_m = error_in_a_frame_that_turns(0.0);
     for yaw_rate_radps in [0.15, -0.3, 0.6] {
         let error_m = error_in_a_frame_that_turns(yaw_rate_radps);
@@ -201,7 +201,7 @@ fn a_frame_may_turn_with_its_vehicle() {
 }
 
 #[test]
-fn one_vehicle_turns_no_frame_of_others_however_often_it_reports() {
+fn frequent_reporter_rotates_no_frame() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..30 {

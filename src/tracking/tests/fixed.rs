@@ -111,7 +111,7 @@ fn common_and_rest(
 /// An hour at two frames a second. A radian of rotation in common moves what is 15 m away by 15 m, a second of delay the
 /// fastest by 2 m.
 #[test]
-fn nothing_moves_the_map_of_fixed_cameras() {
+fn fixed_cameras_hold_map() {
     for (seed, count, is_posed) in [(1, 2, true), (2, 2, false), (3, 3, true)] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let cameras = Camera::around(count, is_posed, &mut rng);
@@ -161,7 +161,7 @@ fn nothing_moves_the_map_of_fixed_cameras() {
 /// Cameras that state that they do not move, without poses or with estimates of them, keep their corrections while nothing
 /// passes.
 #[test]
-fn a_camera_that_declares_to_stand_is_aligned_and_stays_so() {
+fn standing_camera_stays_aligned() {
     for is_posed in [false, true] {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let cameras = Camera::around(2, is_posed, &mut rng);
@@ -211,7 +211,7 @@ fn a_camera_that_declares_to_stand_is_aligned_and_stays_so() {
 
 /// A camera whose pose is right and a vehicle that is wrong by 0.4 m, for five minutes.
 #[test]
-fn a_camera_does_not_take_over_the_error_of_a_vehicle_however_often_it_reports() {
+fn camera_ignores_vehicle_error() {
     for camera_every in [1, 2] {
         let mut rng = ChaCha8Rng::seed_from_u64(7);
         let mut observers = Camera::around(2, true, &mut rng);
@@ -270,7 +270,7 @@ fn off(round: &TracksRound, people: &[Vector2<f64>]) -> Vector2<f64> {
 
 /// The third of three cameras is wrong by 0.9 m more than the others.
 #[test]
-fn the_map_stays_where_it_is_when_a_camera_leaves() {
+fn map_stays_when_camera_leaves() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let mut cameras = Camera::around(3, true, &mut rng);
     cameras[2].offset.x += 0.9;
@@ -298,7 +298,7 @@ fn the_map_stays_where_it_is_when_a_camera_leaves() {
 
 /// Two cameras stand for an hour; the third, wrong by 0.9 m more, joins then.
 #[test]
-fn a_camera_that_joins_an_hour_later_is_aligned_and_does_not_pull_the_others() {
+fn late_camera_is_aligned_to_others() {
     for is_posed in [true, false] {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
         let mut cameras = Camera::around(3, is_posed, &mut rng);

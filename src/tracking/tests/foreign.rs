@@ -48,7 +48,7 @@ fn watching(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectRepo
 }
 
 #[test]
-fn an_object_that_comes_over_keeps_its_identity_and_its_velocity() {
+fn foreign_object_keeps_identity_and_velocity() {
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();
     for frame in 0..30 {
@@ -179,14 +179,14 @@ fn two_cells(later: u64) -> [Vec<Uuid>; 2] {
 }
 
 #[test]
-fn two_cells_agree_on_the_identity_of_the_older_track() {
+fn two_cells_share_older_identity() {
     let [ends, begun] = two_cells(30);
     assert_eq!(ends[..8], begun[..8]);
     assert_eq!(ends[8..], begun[..8]);
 }
 
 #[test]
-fn of_two_tracks_as_old_the_smaller_identity_stays() {
+fn smaller_identity_wins_at_equal_age() {
     let [ends, begun] = two_cells(0);
     let smaller: Vec<Uuid> = (0..8)
         .map(|place| begun[place].min(begun[8 + place]))
@@ -232,7 +232,7 @@ fn lied_to(
 }
 
 #[test]
-fn a_cell_whose_objects_nobody_sees_is_believed_no_more() {
+fn unconfirmed_cell_loses_trust() {
     let mut tracker = tracker();
     let ghost = |number: u128| {
         stated(
@@ -262,7 +262,7 @@ fn a_cell_whose_objects_nobody_sees_is_believed_no_more() {
 }
 
 #[test]
-fn a_cell_that_changes_identities_all_the_time_is_judged_too() {
+fn identity_changes_do_not_evade_judgement() {
     let mut tracker = tracker();
     lied_to(&mut tracker, |frame, _| {
         let ghost = |number: u128| {
@@ -285,7 +285,7 @@ proptest! {
 
     /// Ghosts beside and upon this cell's objects, with any velocity, age and precision, and with their identities.
     #[test]
-    fn a_cell_that_lies_harms_no_object_of_this_cell(seed in prop_oneof![1 => Just(4_861_703_545_525_720_796), 5 => any::<u64>()]) {
+    fn false_cell_harms_no_object(seed in prop_oneof![1 => Just(4_861_703_545_525_720_796), 5 => any::<u64>()]) {
         let honest = lied_to(&mut tracker(), |_, _| Vec::new());
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let lied = lied_to(&mut tracker(), |frame, own| {

@@ -34,7 +34,7 @@ fn existence_of_a_car(is_passed: bool) -> f64 {
 }
 
 #[test]
-fn whoever_has_passed_an_object_looks_at_it_no_more() {
+fn passing_vehicle_counts_no_misses() {
     let [passed, alone] = [true, false].map(existence_of_a_car);
     assert!(
         (passed - alone).abs() < 0.001,
@@ -87,7 +87,7 @@ fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
 }
 
 #[test]
-fn a_liar_is_no_second_witness() {
+fn faulty_vehicle_is_no_second_witness() {
     let [with_liar, without] = [true, false].map(existence_of_a_ghost);
     assert!(
         with_liar < without + 0.02,
@@ -96,7 +96,7 @@ fn a_liar_is_no_second_witness() {
 }
 
 #[test]
-fn a_vehicle_of_little_trust_is_not_believed_the_more_for_it() {
+fn low_trust_increases_no_existence() {
     let existence = |wrong: f64| {
         let mut tracker = tracker();
         tracker.sensors.dormant.keep([(
@@ -123,7 +123,7 @@ fn a_vehicle_of_little_trust_is_not_believed_the_more_for_it() {
 
 /// The vehicle that leaves has seen a duplicate of a parked car in its last frame. The two that stay see the car a metre apart.
 #[test]
-fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
+fn duplicate_ends_with_its_vehicle() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..100 {
@@ -158,7 +158,7 @@ fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
 }
 
 #[test]
-fn a_heading_of_another_aggregator_gives_way_to_the_course() {
+fn foreign_heading_yields_to_course() {
     let mut leader = tracker();
     let mut newcomer = tracker();
     let drive =

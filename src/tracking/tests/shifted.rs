@@ -98,7 +98,7 @@ impl Scene {
 }
 
 #[test]
-fn one_of_several_that_shifts_all_objects_hardly_moves_the_map() {
+fn shifted_vehicle_hardly_moves_map() {
     for (vehicles, has_pose, speed_mps) in [
         (4, false, 0.0),
         (4, true, 0.0),
@@ -134,7 +134,7 @@ fn one_of_several_that_shifts_all_objects_hardly_moves_the_map() {
 
 /// A vehicle that stands has more weight in what all have in common, and no more in what counts as common.
 #[test]
-fn one_that_stands_and_shifts_all_objects_is_not_the_majority() {
+fn standing_shifted_vehicle_is_outvoted() {
     let scene = Scene {
         has_pose: true,
         false_ones_stand: true,
@@ -150,7 +150,7 @@ fn one_that_stands_and_shifts_all_objects_is_not_the_majority() {
 
 /// As many as can be out-voted, all by the same shift.
 #[test]
-fn a_minority_that_shifts_all_objects_moves_the_map_less_than_its_share() {
+fn shifted_minority_moves_map_little() {
     for (vehicles, false_ones) in [(3, 1), (5, 2), (7, 3), (9, 4)] {
         for shift_m in [0.5, 1.0] {
             let (drag_m, counts) = Scene::of(vehicles, false_ones, shift_m).drag();

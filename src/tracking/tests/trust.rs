@@ -7,7 +7,7 @@ use crate::tracking::sensors::Sensors;
 use crate::tracking::trust::{DormantCounts, TrustCounts};
 
 #[test]
-fn whoever_fabricates_or_hides_objects_loses_its_trust() {
+fn fabricating_or_hiding_costs_trust() {
     let mut tracker = tracker();
     let counts = liars(&mut tracker);
     for honest in ["a", "b", "c", "d"] {
@@ -30,7 +30,7 @@ fn whoever_fabricates_or_hides_objects_loses_its_trust() {
 }
 
 #[test]
-fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
+fn first_contributors_are_judged_at_limit() {
     let mut tracker = tracker();
     let mut judged = BTreeSet::new();
     let mut contributors = 0;
@@ -55,7 +55,7 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
 }
 
 #[test]
-fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
+fn observers_precede_vehicles_that_miss() {
     let mut sensors = Sensors::new(ReputationConfig::default());
     let mut id = |n: u32| {
         sensors
@@ -76,7 +76,7 @@ fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
 
 /// Four look straight at the place, and one that they otherwise agree with is sure that something is there.
 #[test]
-fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
+fn sure_vehicle_cannot_outweigh_misses() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..30 {
@@ -114,7 +114,7 @@ fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
 /// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
 /// says as much; of many others nothing is known.
 #[test]
-fn a_liar_that_was_silent_is_still_a_liar() {
+fn distrust_survives_silence() {
     let mut tracker = tracker();
     liars(&mut tracker);
     let mut round = tracker.close(at(400));
@@ -138,7 +138,7 @@ fn a_liar_that_was_silent_is_still_a_liar() {
 }
 
 #[test]
-fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
+fn least_evidence_is_forgotten_first() {
     let mut dormant = DormantCounts::default();
     let config = ReputationConfig::default();
     dormant.keep([
@@ -163,7 +163,7 @@ fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
 
 /// What VOTE has settled weighs in tracks too, as what the ledger says does.
 #[test]
-fn whoever_votes_wrongly_is_not_believed_in_tracks() {
+fn wrong_votes_lower_track_trust() {
     let mut tracker = tracker();
     let wrong = |node: &str| Evidence {
         node: name(node),
@@ -225,7 +225,7 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
 
 /// Clutter of one vehicle says nothing about the detections of others.
 #[test]
-fn a_vehicle_that_invents_objects_makes_those_of_others_hardly_less_sure() {
+fn clutter_barely_affects_other_objects() {
     let least_existence = |invented: usize| {
         let mut tracker = tracker();
         let mut rng = ChaCha8Rng::seed_from_u64(1);

@@ -21,7 +21,7 @@ fn add_vote(voting: &mut WeightedVoting, landmark: &str, node: &str, ms: u64) {
 }
 
 #[test]
-fn votes_that_never_go_stale_leave_one_due_time_a_landmark() {
+fn lasting_votes_share_due_time() {
     let mut voting = voting(1e9);
     for n in 0..300 {
         add_vote(
@@ -37,7 +37,7 @@ fn votes_that_never_go_stale_leave_one_due_time_a_landmark() {
 }
 
 #[test]
-fn every_vote_goes_stale_in_its_time() {
+fn votes_expire_on_time() {
     let mut voting = voting(2.0);
     for (node, ms) in [("a", 0), ("b", 1500), ("a", 1000), ("c", 400)] {
         add_vote(&mut voting, "x", node, ms);

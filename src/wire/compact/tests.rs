@@ -54,7 +54,7 @@ fn survives<T: Payload + PartialEq + std::fmt::Debug>(payload: &T) {
 
 /// With numbers that need no rounding.
 #[test]
-fn every_field_of_every_payload_survives() {
+fn every_field_survives() {
     let node = NodeName::from_static;
     survives(&ObjectReport {
         pose: Some(WirePose {

@@ -189,7 +189,7 @@ fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]
 }
 
 #[test]
-fn each_flaw_of_a_map_has_its_reason() {
+fn map_flaws_have_reasons() {
     fn edge_of(map: &mut GlobalMap) -> &mut PoseCorrection {
         map.pose_corrections.get_mut(&edge()).unwrap()
     }
@@ -297,7 +297,7 @@ fn each_flaw_of_a_map_has_its_reason() {
 }
 
 #[test]
-fn each_flaw_of_verdicts_has_its_reason() {
+fn verdict_flaws_have_reasons() {
     each_flaw_has_its_reason(
         verdicts,
         &[
@@ -340,7 +340,7 @@ fn each_flaw_of_verdicts_has_its_reason() {
 }
 
 #[test]
-fn each_flaw_of_reputations_and_statuses_has_its_reason() {
+fn status_flaws_have_reasons() {
     fn edges(reputations: &mut Reputations) -> &mut Reputation {
         reputations.reputations.get_mut(&edge()).unwrap()
     }
@@ -395,7 +395,7 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
 }
 
 #[test]
-fn what_an_aggregator_sends_may_be_larger_than_a_report() {
+fn map_limit_exceeds_report_limit() {
     let limits = Limits {
         payload_bytes: 256,
         map_bytes: 4096,
@@ -417,7 +417,7 @@ fn what_an_aggregator_sends_may_be_larger_than_a_report() {
 }
 
 #[test]
-fn a_map_from_tomorrow_is_rejected_and_one_from_a_clock_a_little_ahead_is_not() {
+fn map_from_tomorrow_is_rejected() {
     let now = Timestamp(1_732_154_400_000_000);
     let hour = 3_600_000_000;
     assert_eq!(check_fused_at(now.shifted(hour - 1), now), Ok(()));
@@ -444,7 +444,7 @@ fn label() -> impl Strategy<Value = Label> {
 proptest! {
     /// Whatever passes holds only numbers that can be computed with.
     #[test]
-    fn no_number_that_is_none_gets_through(
+    fn non_finite_numbers_are_rejected(
         (confidence, x_m, y_m, covariance_m2) in (number(), number(), number(), [number(), number(), number()]),
         (score, margin, votes) in (number(), number(), btree_map(label(), number(), 0..3)),
         (epoch, text, landmarks) in (any::<u64>(), label(), vec((number(), number()), 0..3)),
@@ -474,7 +474,7 @@ proptest! {
 }
 
 #[test]
-fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
+fn cell_map_needs_position_on_earth() {
     let limits = Limits::default();
     for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
         decode::<CellMap>(&encode(&cell_map(), encoding), &limits).unwrap();
@@ -530,7 +530,7 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
 
 /// The compact encoding rounds numbers: a valid number must not become invalid.
 #[test]
-fn the_largest_valid_numbers_are_valid_after_the_rounding_of_every_encoding() {
+fn largest_numbers_survive_rounding() {
     let object = FusedObject {
         size_m: Some([SIZE_BOUND_M, SIZE_BOUND_M * (1.0 - 1e-9)]),
         velocity_mps: Some([SPEED_BOUND_MPS, -SPEED_BOUND_MPS]),

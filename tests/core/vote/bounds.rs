@@ -63,7 +63,7 @@ fn labels(verdicts: &[Verdict]) -> BTreeMap<LandmarkId, Option<Label>> {
 
 proptest! {
     #[test]
-    fn labels_are_from_votes_and_numbers_are_within_bounds(rounds in rounds()) {
+    fn labels_and_numbers_stay_in_bounds(rounds in rounds()) {
         let mut vote = Vote::new(VoteConfig::default(), Vec::new());
         let mut said: BTreeSet<(LandmarkId, Label)> = BTreeSet::new();
         let mut now = START;
@@ -95,7 +95,7 @@ proptest! {
     }
 
     #[test]
-    fn the_order_of_reports_within_the_first_round_does_not_matter(
+    fn report_order_does_not_matter(
         (statements, order) in proptest::collection::vec(statement(), 1..30)
             .prop_flat_map(|s| (Just(s), Just((0..6).collect::<Vec<usize>>()).prop_shuffle())),
     ) {
@@ -122,7 +122,7 @@ proptest! {
     }
 
     #[test]
-    fn a_confidence_that_all_votes_share_does_not_matter(rounds in rounds(), power in 1i32..5) {
+    fn common_confidence_does_not_matter(rounds in rounds(), power in 1i32..5) {
         let run = |confidence: f64| {
             let mut vote = Vote::new(VoteConfig::default(), Vec::new());
             let mut now = START;
@@ -141,7 +141,7 @@ proptest! {
     }
 
     #[test]
-    fn paper_mode_does_not_mind_the_scale_of_all_confidences(rounds in rounds(), power in 1i32..6) {
+    fn paper_mode_ignores_confidence_scale(rounds in rounds(), power in 1i32..6) {
         let run = |scale: f64| {
             let mut vote = Vote::new(VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() }, Vec::new());
             let mut now = START;

@@ -72,7 +72,7 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
 }
 
 #[test]
-fn confidences_help_when_they_tell_and_do_no_harm_when_they_do_not() {
+fn confidences_help_or_are_harmless() {
     let (online, refined) = accuracy(|_, _, _| 1.0);
     assert!(online > 85.0 && refined > 85.0, "{online} {refined}");
     // The same confidence from everybody says nothing, whatever it is.

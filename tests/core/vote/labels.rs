@@ -46,7 +46,7 @@ fn inventions(round: u64, count: usize) -> Vec<(String, String)> {
 }
 
 #[test]
-fn new_labels_are_heard_while_one_vehicle_invents_labels_without_end() {
+fn new_labels_survive_label_flood() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for round in 1..40 {
         // The liar speaks first, last, and on the others' place too.
@@ -78,7 +78,7 @@ fn new_labels_are_heard_while_one_vehicle_invents_labels_without_end() {
 }
 
 #[test]
-fn a_vehicle_alone_goes_on_with_the_labels_that_it_stated_last() {
+fn lone_vehicle_keeps_latest_labels() {
     let mut vote = Vote::new(
         VoteConfig {
             max_labels: 16,
@@ -111,7 +111,7 @@ fn a_vehicle_alone_goes_on_with_the_labels_that_it_stated_last() {
 }
 
 #[test]
-fn a_ledger_full_of_labels_leaves_room_for_the_cells_own() {
+fn full_ledger_admits_cell_labels() {
     let mut ledger = ReputationLedger::default();
     for number in 0..300 {
         let label = format!("invented-{number:03}").into();
@@ -142,7 +142,7 @@ fn a_ledger_full_of_labels_leaves_room_for_the_cells_own() {
 }
 
 #[test]
-fn votes_that_leave_with_their_labels_are_counted() {
+fn evicted_votes_are_counted() {
     let mut vote = Vote::new(
         VoteConfig {
             max_labels: 8,
@@ -162,7 +162,7 @@ fn votes_that_leave_with_their_labels_are_counted() {
 }
 
 #[test]
-fn synonyms_of_the_cell_hold_everywhere_and_a_landmarks_own_go_first() {
+fn landmark_synonyms_override_cell_synonyms() {
     for mode in [VoteMode::Weighted, VoteMode::Paper] {
         let synonyms = [("vase".into(), "sports ball".into())].into();
         let config = VoteConfig {

@@ -50,7 +50,7 @@ fn verdict(vote: &mut Vote, votes: &[(&str, &str)]) -> Option<String> {
 }
 
 #[test]
-fn a_restart_does_not_trust_who_was_right_for_long_and_turned() {
+fn restart_distrusts_late_deceiver() {
     let mut ledger = ReputationLedger::default();
     record(&mut ledger, "turncoat", 10_000, true);
     record(&mut ledger, "turncoat", 600, false);
@@ -72,7 +72,7 @@ fn a_restart_does_not_trust_who_was_right_for_long_and_turned() {
 }
 
 #[test]
-fn names_used_up_do_not_make_a_restart_forget_who_was_right() {
+fn exhausted_names_keep_earned_trust() {
     let mut ledger = ReputationLedger::default();
     record(&mut ledger, "zoe", 40, true);
     for number in 0..2000 {
@@ -89,7 +89,7 @@ fn names_used_up_do_not_make_a_restart_forget_who_was_right() {
 }
 
 #[test]
-fn a_standby_that_counted_the_latest_votes_itself_takes_over_those_before() {
+fn standby_adopts_older_votes() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut ledger = ReputationLedger::default();
     record(&mut ledger, "a", 200, false);
@@ -132,7 +132,7 @@ fn a_standby_that_counted_the_latest_votes_itself_takes_over_those_before() {
 }
 
 #[test]
-fn evidence_that_is_withdrawn_no_longer_counts() {
+fn withdrawn_evidence_stops_counting() {
     let mut forged = ReputationLedger::default();
     record(&mut forged, "liar", 1000, true);
     record(&mut forged, "a", 1000, false);

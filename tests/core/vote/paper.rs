@@ -111,7 +111,7 @@ fn report() -> impl Strategy<Value = Report> {
 
 proptest! {
     #[test]
-    fn paper_mode_is_the_printed_formulas(rounds in proptest::collection::vec(proptest::collection::vec(report(), 0..6), 1..30)) {
+    fn paper_mode_matches_printed_formulas(rounds in proptest::collection::vec(proptest::collection::vec(report(), 0..6), 1..30)) {
         let config = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
         let mut vote = Vote::new(config, (0..PLACES.len()).map(landmark).collect());
         let mut reference = Reference::default();
@@ -148,7 +148,7 @@ proptest! {
 }
 
 #[test]
-fn visibility_grows_off_axis_as_printed() {
+fn visibility_grows_off_axis() {
     let score = |heading: f64| {
         let config = VoteConfig {
             mode: VoteMode::Paper,

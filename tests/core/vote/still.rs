@@ -69,7 +69,7 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
 }
 
 #[test]
-fn verdicts_about_objects_that_stay_are_right_and_do_not_flicker() {
+fn stationary_objects_have_steady_verdicts() {
     for (vehicles, liars) in [(3, 0), (5, 0), (3, 1), (5, 2), (9, 4)] {
         for landmarks in [1, 3, 6] {
             for seed in 1..=3 {
@@ -92,7 +92,7 @@ fn verdicts_about_objects_that_stay_are_right_and_do_not_flicker() {
 }
 
 #[test]
-fn vehicles_that_waver_do_not_outvote_one_that_is_sure() {
+fn wavering_votes_cannot_outvote_sure() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut now = Timestamp(1_700_000_000_000_000);

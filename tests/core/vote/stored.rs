@@ -28,7 +28,7 @@ fn on<'a>(verdicts: &'a [Verdict], landmark: &str) -> &'a Verdict {
 }
 
 #[test]
-fn who_corrects_an_answer_has_answered_once_and_is_believed_as_much_as_who_did_not_err() {
+fn corrected_answer_counts_once() {
     let weighted = WeightedConfig {
         freshness_s: 1e9,
         smoothing_share: 0.0,
@@ -70,7 +70,7 @@ fn who_corrects_an_answer_has_answered_once_and_is_believed_as_much_as_who_did_n
 }
 
 #[test]
-fn where_all_waver_the_votes_on_other_places_still_count() {
+fn wavering_landmark_leaves_others_counting() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for (node, first, second) in [
         ("a", "cup", "mouse"),

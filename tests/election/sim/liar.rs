@@ -18,7 +18,7 @@ const FORGED: u64 = 1 << 40;
 
 /// The lead stays where it is, and every honest node gets its rounds, while one in twenty packets is lost.
 #[test]
-fn a_liar_takes_the_lead_from_nobody() {
+fn false_claim_takes_no_lead() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         start_all(&mut world);
@@ -67,7 +67,7 @@ fn a_liar_takes_the_lead_from_nobody() {
 /// The leader hangs, and a member answers each question about it with "it is alive": it takes as long as without the member
 /// until another node leads. The member has the leader's last sign of life, and can make none.
 #[test]
-fn a_member_that_vouches_for_a_hung_leader_delays_no_takeover() {
+fn vouched_hung_leader_is_replaced() {
     for_seeds(seeds() / 5, |seed| {
         let mut world = cell(seed);
         start_all(&mut world);
@@ -354,7 +354,7 @@ const MAX_GAP: u64 = SECOND;
 /// A member sends one kind of false message for seconds, while the leader works, and then while it hangs: no honest
 /// vehicle is without maps for a second, and every map that it accepts is judged. Prints the table of messages and lies.
 #[test]
-fn no_lie_of_a_member_costs_a_vehicle_its_maps() {
+fn false_claims_cost_no_maps() {
     let mut outcomes = [Outcome::default(); LIES.len()];
     for_seeds(seeds(), |seed| {
         let number = seed as usize % LIES.len();

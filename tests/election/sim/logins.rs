@@ -10,7 +10,7 @@ use crate::sim::world::{MS, World};
 /// More than half of the followers, two at least, cannot log in at their leader's broker. Another candidate leads soon,
 /// without a gap for the others, and goes on. The leader comes back only when its broker does.
 #[test]
-fn a_leader_at_whose_broker_most_cannot_log_in_makes_way() {
+fn leader_refusing_most_logins_yields() {
     for_seeds(seeds() / 10, |seed| {
         let Some((mut world, leader)) = settled(seed) else {
             return;
@@ -58,7 +58,7 @@ fn a_leader_at_whose_broker_most_cannot_log_in_makes_way() {
 
 /// The standby is reached by its messages only when its leader is killed: it leads, and hands the lead on.
 #[test]
-fn followers_of_a_successor_that_they_cannot_reach_go_on_to_the_next() {
+fn followers_skip_unreachable_successor() {
     for_seeds(seeds() / 10, |seed| {
         let Some((mut world, leader)) = settled(seed) else {
             return;
@@ -84,7 +84,7 @@ fn followers_of_a_successor_that_they_cannot_reach_go_on_to_the_next() {
 
 /// A standby that most cannot reach is found out while its leader lives: it does not take over.
 #[test]
-fn nobody_waits_for_a_standby_that_most_cannot_reach() {
+fn unreachable_standby_delays_no_takeover() {
     for_seeds(seeds() / 10, |seed| {
         let Some((mut world, leader)) = settled(seed) else {
             return;
@@ -118,7 +118,7 @@ fn nobody_waits_for_a_standby_that_most_cannot_reach() {
 
 /// One node that cannot log in, or says so, ends no leadership that others follow, or that it does not equal.
 #[test]
-fn one_node_that_cannot_log_in_moves_no_lead() {
+fn one_failed_login_moves_no_lead() {
     for_seeds(seeds() / 10, |seed| {
         let mut world = cell(seed);
         start_all(&mut world);

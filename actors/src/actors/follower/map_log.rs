@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_line_is_removed_after_a_crash() {
+    fn partial_line_is_removed() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("maps.jsonl");
         let cell = NodeName::from_static("lot-1");
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn the_text_of_another_file_is_not_removed() {
+    fn foreign_text_is_kept() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("notes.txt");
         std::fs::write(&path, "a note").unwrap();
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_large_log_is_renamed_and_a_new_one_begun() {
+    fn large_log_is_rotated() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("maps.jsonl");
         File::create(&path).unwrap().set_len(MAX_BYTES).unwrap();
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_cannot_be_written_is_tried_again_later() {
+    fn unwritable_log_is_retried() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("absent").join("maps.jsonl");
         let cell = NodeName::from_static("lot-1");

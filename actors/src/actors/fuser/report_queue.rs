@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_latest_of_each_vehicle_and_kind_waits() {
+    fn latest_report_per_vehicle_waits() {
         let queue = LatestReportQueue::default();
         let push = |node: &str, kind, seq| {
             let report = Arc::new(ObjectReport::new(
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_and_its_parts_share_a_budget_of_objects_and_others_have_their_own() {
+    fn vehicle_parts_share_object_budget() {
         let queue = LatestReportQueue::default();
         let push = |node: &str, at_us: u64, objects: usize| {
             let object = PerceivedObject::new("car", 0.5, 0.0, 0.0);

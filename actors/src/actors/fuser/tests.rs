@@ -42,7 +42,7 @@ fn standby() -> FuserState {
 }
 
 #[tokio::test]
-async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
+async fn forged_map_replaces_no_leader() {
     let elected = Leadership {
         position: Position::Following,
         epoch: Some(epoch(7, "edge")),
@@ -106,7 +106,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
 }
 
 #[tokio::test]
-async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more() {
+async fn expelled_leaders_map_is_dropped() {
     let mut fuser = standby();
     let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
         panic!("a map")
@@ -142,7 +142,7 @@ fn take(
 /// A wrong clock is reported with its error, both while the reports are refused and later, when
 /// they are corrected.
 #[test]
-fn a_clock_that_is_off_is_named() {
+fn wrong_clock_is_reported() {
     let mut fuser = standby();
     let late = NodeName::from_static("late");
     for n in 1..=20 {
@@ -170,7 +170,7 @@ fn a_clock_that_is_off_is_named() {
 }
 
 #[test]
-fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
+fn time_in_seconds_is_reported() {
     let mut fuser = standby();
     for n in 1..=20 {
         let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
@@ -191,7 +191,7 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
 
 /// A node dates its reports in the cell's time, so its clock does not make them late.
 #[test]
-fn late_reports_of_a_node_are_not_blamed_on_its_clock() {
+fn late_reports_blame_no_clock() {
     let mut fuser = standby();
     for n in 1..=20 {
         let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
@@ -215,7 +215,7 @@ fn late_reports_of_a_node_are_not_blamed_on_its_clock() {
 /// Where objects are tracked, they may be anywhere near the locations: three metres, but not three
 /// hundred.
 #[test]
-fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
+fn vehicle_in_centimetres_is_reported() {
     let mut fuser = standby();
     let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 30\ny_m = 0").unwrap();
     let mut config = FusionConfig::default();
@@ -238,7 +238,7 @@ fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
 
 /// Two programs with one name are reported; a program that restarts is not.
 #[test]
-fn two_programs_that_report_under_one_name_are_told() {
+fn two_same_named_programs_reported() {
     for (senders, is_told) in [(1, false), (2, true)] {
         let mut fuser = standby();
         for n in 0..60 {
@@ -267,7 +267,7 @@ fn two_programs_that_report_under_one_name_are_told() {
 /// A vehicle that reports in centimetres has no object at a landmark, or objects far from its
 /// camera; it is reported independent of other vehicles.
 #[test]
-fn a_vehicle_whose_objects_are_nowhere_is_named() {
+fn unplaceable_vehicle_is_reported() {
     let mut fuser = standby();
     let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 3\ny_m = 0").unwrap();
     fuser.aggregator =
@@ -313,7 +313,7 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
 /// A vehicle that states that it does not move, and stands within the error of its pose, is not
 /// reported.
 #[test]
-fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
+fn moving_vehicle_claiming_rest_reported() {
     let mut fuser = standby();
     for n in 1..=60 {
         let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
@@ -341,7 +341,7 @@ fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
 
 /// The vehicle of an entry that the map leaves out is named, with the reason.
 #[test]
-fn vehicles_whose_objects_the_map_leaves_out_are_named() {
+fn vehicles_missing_from_map_reported() {
     let fuser = standby();
     let entry = |reason, vehicle: &'static str| InvalidEntry {
         reason,
@@ -368,7 +368,7 @@ fn vehicles_whose_objects_the_map_leaves_out_are_named() {
 }
 
 #[test]
-fn locations_that_only_one_side_knows_are_named() {
+fn one_sided_landmarks_are_reported() {
     let now = Timestamp(1_795_000_000_000_000);
     let report = |seq: u64| ObjectReport::new(NodeName::from_static("euclid"), seq, now);
     let mut without = standby();

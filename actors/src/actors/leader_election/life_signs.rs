@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_but_the_leader_makes_its_signs_of_life() {
+    fn only_leader_sends_life_signs() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot");
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();

@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_term_that_was_waited_for_is_on_disk() {
+    async fn awaited_term_is_on_disk() {
         let directory = tempfile::tempdir().unwrap();
         let mut writer = TermWriter::new(Some(file(directory.path())));
         for term in (1..20).chain([5]) {
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn a_forged_term_on_disk_is_set_aside() {
+    fn forged_term_is_set_aside() {
         let directory = tempfile::tempdir().unwrap();
         let file = file(directory.path());
         for (saved, read) in [
@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_disk_that_fails_holds_nobody_up() {
+    async fn failing_disk_delays_no_vote() {
         let directory = tempfile::tempdir().unwrap();
         let occupied = directory.path().join("occupied");
         std::fs::write(&occupied, b"").unwrap();
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_disk_that_hangs_is_waited_for_once() {
+    async fn hanging_disk_is_awaited_once() {
         let (wanted, _terms) = watch::channel(3);
         let (_answers, answer) = watch::channel(DiskAnswer::default());
         let mut writer = TermWriter {

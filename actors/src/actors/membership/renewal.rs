@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn junk_starts_no_work_and_a_refusal_is_shown_when_no_certificate_comes() {
+    fn junk_ignored_and_refusal_shown() {
         let directory = tempfile::tempdir().unwrap();
         let mut renewals = renewals(&directory);
         let credentials = Arc::clone(&renewals.credentials);
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_clock_is_named_until_it_is_right() {
+    fn wrong_clock_reported_until_corrected() {
         let directory = tempfile::tempdir().unwrap();
         let mut renewals = renewals(&directory);
         let credentials = Arc::clone(&renewals.credentials);

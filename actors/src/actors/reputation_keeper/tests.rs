@@ -96,7 +96,7 @@ fn arguments(
 }
 
 #[tokio::test]
-async fn evidence_of_others_is_judged_counted_and_answered() {
+async fn foreign_evidence_is_judged() {
     let (gateway, mut published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
@@ -203,7 +203,7 @@ impl Certificates {
 }
 
 #[tokio::test]
-async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_revoked() {
+async fn revoked_signer_loses_saved_evidence() {
     let (gateway, mut published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
@@ -299,7 +299,7 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
 }
 
 #[tokio::test]
-async fn what_a_node_counted_under_a_revoked_certificate_does_not_come_back_with_a_new_one() {
+async fn new_certificate_restores_no_counts() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
@@ -358,7 +358,7 @@ async fn what_a_node_counted_under_a_revoked_certificate_does_not_come_back_with
 }
 
 #[tokio::test]
-async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch_for() {
+async fn candidates_broker_relays_no_vouching() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
@@ -412,7 +412,7 @@ async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch
 }
 
 #[tokio::test]
-async fn a_ledger_that_an_earlier_version_let_be_poisoned_is_not_used() {
+async fn poisoned_ledger_is_refused() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
@@ -464,7 +464,7 @@ async fn a_ledger_that_an_earlier_version_let_be_poisoned_is_not_used() {
 }
 
 #[tokio::test]
-async fn a_file_is_held_to_the_bounds_of_the_wire() {
+async fn saved_ledger_obeys_wire_bounds() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
@@ -543,7 +543,7 @@ async fn a_file_is_held_to_the_bounds_of_the_wire() {
 }
 
 #[tokio::test]
-async fn a_node_that_booted_in_1970_judges_a_reset_by_the_cells_time() {
+async fn node_from_1970_uses_cell_time() {
     let (gateway, _published) = listening::slot().await;
     let mut keeper = ReputationKeeperState::new(arguments(&gateway, &Arc::default()));
     let now = clock::now();
@@ -569,7 +569,7 @@ async fn a_node_that_booted_in_1970_judges_a_reset_by_the_cells_time() {
 }
 
 #[tokio::test]
-async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
+async fn altered_ledger_is_set_aside() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
@@ -606,7 +606,7 @@ async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
 
 /// A signer of evidence may make counts leap, and wait for its receivers to restart.
 #[tokio::test]
-async fn counts_leap_no_further_after_a_restart_than_before() {
+async fn restart_widens_no_count_jump() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
@@ -654,7 +654,7 @@ async fn counts_leap_no_further_after_a_restart_than_before() {
 /// A standby that takes over waits for the leader's evidence, and ignores messages of other nodes
 /// in the leader's name.
 #[tokio::test]
-async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
+async fn election_receives_only_verified_evidence() {
     let (gateway, _published) = listening::slot().await;
     let (election, mut told) = listening::slot().await;
     let counters = Arc::<Counters>::default();

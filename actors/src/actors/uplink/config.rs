@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_are_checked_as_those_of_the_cells_broker() {
+    fn keys_use_cell_broker_checks() {
         UplinkConfig::default().validate().unwrap();
         for (text, key) in [
             ("password = \"hush4711\"", "password"),

@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_rate_is_the_configured_one_and_five_times_that_beside_a_neighbour() {
+    fn neighbour_raises_map_rate_fivefold() {
         let mut pace = MapPace::new(2.0);
         assert_eq!(count(&mut pace, 5_000), 21, "the first at once");
         assert_eq!(count(&mut pace, 15_000), 20);

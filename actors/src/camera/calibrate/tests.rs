@@ -110,7 +110,7 @@ fn take_photographs(directory: &Path) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_known_camera_is_recovered_within_one_percent_and_survives_its_file() {
+fn camera_is_recovered_within_percent() {
     let directory = tempfile::tempdir().unwrap();
     let mut images = take_photographs(directory.path());
     let blank = Mat::new_rows_cols_with_default(480, 640, CV_8UC1, Scalar::all(90.0)).unwrap();
@@ -173,7 +173,7 @@ fn errors_name_the_image() {
 }
 
 #[test]
-fn a_bad_calibration_file_is_refused_by_name() {
+fn bad_calibration_file_is_refused() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("camera.toml");
     assert!(matches!(

@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn plays_one_line_per_frame_once_or_again_and_again() {
+    fn plays_lines_once_or_looped() {
         let text = format!("{CUP}\n[]\n{CUP}\n");
         assert_eq!(counts(open(&text, false).unwrap(), 5), [1, 0, 1, 0, 0]);
         assert_eq!(counts(open(&text, true).unwrap(), 5), [1, 0, 1, 1, 0]);
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_recording_is_named_with_its_line() {
+    fn bad_recording_names_its_line() {
         for bad in [
             "{",
             r#"{"label":"cup"}"#,

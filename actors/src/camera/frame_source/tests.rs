@@ -43,7 +43,7 @@ fn write_images(directory: &Path) {
 }
 
 #[test]
-fn images_come_in_order_from_a_directory_and_from_a_pattern() {
+fn directory_and_pattern_keep_order() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
     for path in [
@@ -72,7 +72,7 @@ fn images_come_in_order_from_a_directory_and_from_a_pattern() {
 }
 
 #[test]
-fn a_percent_sign_in_a_name_is_a_pattern_only_where_a_number_can_stand() {
+fn percent_sign_is_pattern_before_number() {
     let parent = tempfile::tempdir().unwrap();
     for (folder, pattern) in [
         ("run_50%", ""),
@@ -95,7 +95,7 @@ fn a_percent_sign_in_a_name_is_a_pattern_only_where_a_number_can_stand() {
 }
 
 #[test]
-fn a_bad_image_is_passed_over_and_the_rest_is_played() {
+fn bad_image_is_skipped() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
     std::fs::write(directory.path().join("f001.png"), "half a fi").unwrap();
@@ -138,7 +138,7 @@ fn images_keep_their_rate() {
 }
 
 #[test]
-fn what_cannot_be_opened_is_named_with_its_reason() {
+fn unopenable_source_names_reason() {
     let empty = tempfile::tempdir().unwrap();
     let text = empty.path().join("camera");
     std::fs::write(&text, "not a camera").unwrap();
@@ -193,7 +193,7 @@ fn bad_configuration_is_refused() {
 }
 
 #[test]
-fn no_part_of_a_password_is_in_any_text_about_a_source() {
+fn source_texts_hide_password() {
     for password in [
         "Geh/eim1",
         "Geh eim1",

@@ -290,7 +290,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn secrets_of_addresses_are_not_shown() {
+    fn address_secrets_are_hidden() {
         assert_eq!(
             without_credentials("rtsp://user:p@ss@camera:554/1"),
             "rtsp://camera:554/1"

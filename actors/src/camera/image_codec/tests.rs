@@ -42,7 +42,7 @@ fn exif(orientation: u8) -> Vec<u8> {
 }
 
 #[test]
-fn a_photograph_is_turned_upright_as_its_camera_says() {
+fn photograph_is_turned_upright() {
     let jpeg = encode_jpeg(&flag(), 95).unwrap();
     // Orientation by EXIF 2.3: size, and the middle of the red quarter.
     for (orientation, size, (row, column)) in [
@@ -76,7 +76,7 @@ fn a_photograph_is_turned_upright_as_its_camera_says() {
 }
 
 #[test]
-fn every_format_is_read_by_its_content_as_bgr() {
+fn format_is_recognised_by_content() {
     use image::{ExtendedColorType, ImageFormat};
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("frame.png");
@@ -116,7 +116,7 @@ fn every_format_is_read_by_its_content_as_bgr() {
 }
 
 #[test]
-fn what_is_no_whole_image_is_refused() {
+fn incomplete_image_is_refused() {
     let jpeg = encode_jpeg(&flag(), 95).unwrap();
     let mut png = Cursor::new(Vec::new());
     image::write_buffer_with_format(
@@ -141,7 +141,7 @@ fn what_is_no_whole_image_is_refused() {
 }
 
 #[test]
-fn gray_and_color_pictures_survive_jpeg() {
+fn gray_and_color_survive_jpeg() {
     assert!(is_near(
         color_at(&decode(&encode_jpeg(&flag(), 95).unwrap()).unwrap(), 8, 12),
         RED
@@ -161,7 +161,7 @@ fn gray_and_color_pictures_survive_jpeg() {
 }
 
 #[test]
-fn a_header_that_states_more_than_a_machine_has_is_an_error() {
+fn oversized_header_is_refused() {
     let error = decode(b"P6\n65000 65000\n255\n").unwrap_err();
     assert!(
         matches!(error, ImageError::Malformed(image::ImageError::Limits(_))),
@@ -170,7 +170,7 @@ fn a_header_that_states_more_than_a_machine_has_is_an_error() {
 }
 
 #[test]
-fn a_jpeg_without_its_end_is_refused_as_every_other_cut_image_is() {
+fn jpeg_without_end_is_refused() {
     let whole = encode_jpeg(&flag(), 95).unwrap();
     let thumbnail = [
         &[0xff, 0xe1],

@@ -347,7 +347,7 @@ mod tests {
     use crate::transport::pki::Authority;
 
     #[test]
-    fn the_services_group_reads_the_nodes_certificate_and_key_and_not_the_cells_key() {
+    fn services_group_cannot_read_cell_key() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let node = NodeName::from_static("euclid");

@@ -616,7 +616,7 @@ mod tests {
     }
 
     #[test]
-    fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
+    fn rating_candidate_keeps_reputations() {
         use ecod::aggregator::Algorithms::{Both, Pace};
         use ecod::tracking::TracksMode::{Auto, Off, On};
         let spot = toml::from_str("id = \"slot\"\nx_m = 0.0\ny_m = 0.0").unwrap();
@@ -642,7 +642,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_started_anew_still_says_whom_the_node_follows() {
+    fn restarted_part_still_reports_aggregator() {
         let config = NodeConfig {
             role: Role::Cav,
             ..NodeConfig::default()

@@ -253,7 +253,7 @@ mod tests {
     "#;
 
     #[test]
-    fn a_guest_never_leads_and_has_nothing_of_its_own_cell() {
+    fn guest_cannot_lead() {
         let directory = tempfile::tempdir().unwrap();
         let own = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21\n[mqtt]\nuser = \"euclid\"\npassword = \"hush\"\n[fusion.pace]\ngate_m = 2.0\n[membership]\nkey = \"a long enough key\"\nbind = \"0.0.0.0:17884\"\n";
         let config = vehicle(directory.path(), CELLS, own).unwrap();
@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_name_the_file_the_cell_and_the_key() {
+    fn errors_name_file_and_key() {
         let directory = tempfile::tempdir().unwrap();
         let error = |cells: &str| {
             vehicle(directory.path(), cells, "")

@@ -60,7 +60,7 @@ mod tests {
     use crate::transport::pki::TlsConfig;
 
     #[test]
-    fn the_next_step_is_the_command_for_exactly_this_cell() {
+    fn next_step_names_cell_command() {
         let mut config = NodeConfig {
             name: Some(NodeName::from_static("euclid")),
             cell: NodeName::from_static("lot-1"),

@@ -397,7 +397,7 @@ mod tests {
     "#;
 
     #[test]
-    fn a_description_fills_in_what_a_nodes_own_file_leaves_open() {
+    fn description_fills_missing_keys() {
         let config = own("[fusion.round]\nperiod_s = 0.2\n[fusion.vote.synonyms]\nmug = \"cup\"")
             .described(CELL)
             .unwrap();
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_values_in_both_are_no_contradiction() {
+    fn equal_values_are_no_contradiction() {
         let same = own(
             "[fusion.pace]\ngate_m = 1.0\n[[landmarks]]\nid = \"slot-0\"\nx_m = 0.0\ny_m = 0.5\n\
                         [[landmarks]]\nid = \"slot-1\"\nx_m = 2.5\ny_m = 0.0",
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn a_contradiction_names_the_key_and_both_values() {
+    fn contradiction_names_both_values() {
         for (toml, parts) in [
             // Equal to the default, but explicitly stated.
             (
@@ -457,7 +457,7 @@ mod tests {
     }
 
     #[test]
-    fn a_description_has_shared_keys_alone_and_values_within_their_ranges() {
+    fn only_valid_shared_keys_pass() {
         for (toml, parts) in [
             ("name = \"edge\"", ["line 1", "unknown field", "name"]),
             (
@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn a_description_that_the_cells_links_cannot_carry_is_refused_with_its_cost() {
+    fn oversized_description_names_cost() {
         let locations = |count: usize| -> String {
             (0..count)
                 .map(|n| format!("[[landmarks]]\nid = \"slot-{n}\"\nx_m = {n}\ny_m = 0\n"))
@@ -516,7 +516,7 @@ mod tests {
 
     #[cfg(feature = "camera")]
     #[test]
-    fn sizes_of_labels_are_those_of_the_cell_where_there_is_a_camera() {
+    fn cell_label_sizes_need_camera() {
         let sizes = "[camera.projection.sizes.labels]\ncar = { width_m = 1.8, height_m = 1.5 }";
         let camera = "[camera.source]\nkind = \"v4l2\"\nwidth = 640\nheight = 480\n[camera.detector]\nkind = \"placard\"\n";
         let described = own(camera).described(sizes).unwrap();

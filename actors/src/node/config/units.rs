@@ -152,7 +152,7 @@ mod tests {
 
     #[cfg(feature = "camera")]
     #[test]
-    fn sizes_in_centimetres_are_noticed_by_what_is_usual_and_by_what_no_road_bears() {
+    fn sizes_in_centimetres_are_noticed() {
         let of = |sizes: &str| {
             let text = format!("[camera]\n{CAMERA}\n[camera.projection.sizes]\n{sizes}");
             toml::from_str::<NodeConfig>(&text)
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn slips_of_units_are_noticed_and_usual_values_are_not() {
+    fn unit_slips_are_noticed() {
         for (key, value, unit) in [
             ("camera.mount.height_m", 150.0, "metres"),
             ("fusion.pace.gate_m", 50.0, "metres"),

@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_is_small_even_uncompressed_and_whole() {
+    fn page_is_whole_and_small() {
         let bytes: usize = ASSETS.iter().map(|asset| asset.content.len()).sum();
         println!(
             "page: {bytes} bytes in {} files, uncompressed",
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_gets_map_and_timeline_as_one_script() {
+    fn report_includes_map_and_timeline() {
         let view = view();
         let script = view_script();
         for id in [
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_inline_or_from_elsewhere() {
+    fn page_has_no_foreign_content() {
         for asset in ASSETS {
             for forbidden in ["https://", "style=", "onclick=", "innerHTML", "eval("] {
                 assert!(

@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_taken_while_somebody_looks_and_five_a_second_at_most() {
+    fn viewers_get_five_frames_per_second() {
         let feed = CameraFeed::default();
         let taken = || {
             let frames = (0..30).map(|frame| Timestamp(1_000_000 + frame * 1_000_000 / 30));

@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn boxes_are_shares_of_a_picture_that_is_no_wider_than_a_page_needs() {
+    fn boxes_are_fractions_of_picture() {
         let size = Size::new(1920, 1080);
         let image = Mat::new_size_with_default(size, CV_8UC3, Scalar::all(90.0)).unwrap();
         let bounding_box = BoundingBox {

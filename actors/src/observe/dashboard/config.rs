@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_that_others_reach_needs_a_token() {
+    fn reachable_address_needs_token() {
         validate("127.0.0.1:8080", None).unwrap();
         validate("[::1]:8080", None).unwrap();
         for address in ["0.0.0.0:8080", "10.0.0.2:8080", "[::]:8080"] {

@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn two_points_give_scale_direction_and_place() {
+    fn two_points_place_plan() {
         let upright = plan(
             "a.png".into(),
             [([100.0, 300.0], [0.0, 0.0]), ([300.0, 100.0], [10.0, 10.0])],
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_that_cannot_be_shown_names_the_key_and_the_remedy() {
+    fn unusable_plan_names_remedy() {
         let directory = tempfile::tempdir().unwrap();
         let good = [([0.0, 0.0], [0.0, 0.0]), ([640.0, 480.0], [10.0, -7.5])];
         let file = |name: &str, content: &[u8]| {

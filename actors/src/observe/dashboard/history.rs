@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failover_ends_one_term_and_begins_another_with_its_gap() {
+    fn failover_starts_new_term() {
         let mut history = History::default();
         let epoch = |leader, term| Epoch::new(term, NodeName::from_static(leader));
         history.add_leadership(&led_by("edge", 3), seconds(1));
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leader_that_is_found_again_is_no_failover() {
+    fn rediscovered_leader_is_no_failover() {
         let mut history = History::default();
         history.add_leadership(&led_by("edge", 3), seconds(1));
         history.add_leadership(&Leadership::default(), seconds(2));
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_run_is_kept_in_bounds() {
+    fn long_run_is_bounded() {
         let mut history = History::default();
         for n in 0..1000 {
             history.add_leadership(

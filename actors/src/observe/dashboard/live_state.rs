@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn the_latest_report_is_kept_and_strangers_find_no_room() {
+    fn latest_report_survives_strangers() {
         let live_state = LiveState::default();
         for seq in 1..=3 {
             live_state.update(&report("euclid", seq), Timestamp(seq));
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_that_left_and_vehicles_that_fell_silent_give_way() {
+    fn departed_nodes_are_evicted() {
         let live_state = LiveState::default();
         let status = |node: String, state| {
             let starting = NodeStatus::starting(
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn who_took_its_status_back_at_every_broker_is_not_there() {
+    fn withdrawn_status_is_removed() {
         let live_state = LiveState::default();
         let say = |state, via: &str| {
             let starting = NodeStatus::starting(
@@ -470,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn troubles_of_the_cell_are_told_once_by_who_knows_best() {
+    fn cell_troubles_are_shown_once() {
         let live_state = LiveState::default();
         let trouble = |kind: &str, about: Option<&str>, cause: &str| Trouble {
             kind: kind.into(),
@@ -555,7 +555,7 @@ mod tests {
     }
 
     #[test]
-    fn the_words_of_one_member_displace_nothing_and_advise_nobody() {
+    fn member_displaces_no_other_troubles() {
         let live_state = LiveState::default();
         let say = |node: &str, troubles| {
             let starting = NodeStatus::starting(
@@ -636,7 +636,7 @@ mod tests {
 
     /// A stolen certificate may be used in the names of any number of parts.
     #[test]
-    fn the_parts_of_one_node_leave_room_for_other_nodes() {
+    fn node_parts_leave_room() {
         let live_state = LiveState::default();
         let status = |node: &str, state| {
             let starting = NodeStatus::starting(

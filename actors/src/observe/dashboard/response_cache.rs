@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_fresh_or_was_costly_is_not_made_again() {
+    fn fresh_or_costly_response_reused() {
         let mut made = 0;
         let mut ask = |response_cache: &ResponseCache<u32>, cost: Duration| {
             let make = || {

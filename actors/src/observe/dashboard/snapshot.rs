@@ -240,7 +240,7 @@ mod tests {
     use crate::transport::mqtt::Incoming;
 
     #[test]
-    fn who_no_longer_answers_or_is_only_known_from_a_lost_broker_is_gone() {
+    fn silent_or_lost_nodes_are_removed() {
         let name = NodeName::from_static;
         let edge: BrokerAddress = "10.0.0.2:1883".parse().unwrap();
         let euclid: BrokerAddress = "10.0.0.3:1883".parse().unwrap();
@@ -318,7 +318,7 @@ mod tests {
         assert_eq!(alive(&[], &up), ["both"]);
     }
     #[test]
-    fn a_page_is_linked_where_a_browser_here_may_reach_it() {
+    fn reachable_page_is_linked() {
         let link = |announced: &str, host: &str| {
             let starting = NodeStatus::starting(
                 NodeName::from_static("euclid"),

@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn who_comes_and_goes_what_goes_wrong_and_whom_nobody_believes_are_events_once() {
+    fn events_are_listed_once() {
         let mut timeline = Timeline::new(600 * SECOND, SECOND);
         let trouble = Trouble {
             kind: "clock_off".into(),
@@ -334,7 +334,7 @@ mod tests {
     /// Ten minutes of a small cell are held second by second, an hour of the largest maps within
     /// the bound.
     #[test]
-    fn ten_minutes_are_held_in_bounded_memory() {
+    fn ten_minutes_fit_bounded_memory() {
         let span = 600 * SECOND;
         let mut small = ThinnedSeries::new(span, SECOND);
         for tenth in 0..36_000 {
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn the_map_at_a_time_is_the_latest_before() {
+    fn latest_earlier_map_is_shown() {
         let mut series = ThinnedSeries::new(600 * SECOND, SECOND);
         assert_eq!(series.at(at(1)), None);
         for second in [10, 12, 14] {
@@ -398,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_went_back_loses_nothing_and_all_is_told_in_order() {
+    fn backward_clock_keeps_order() {
         let mut timeline = Timeline::new(Duration::MAX, Duration::ZERO);
         for second in [100, 101, 50, 51] {
             timeline.event(EventKind::Gap, second.to_string(), at(second));

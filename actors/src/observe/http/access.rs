@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn on_loopback_only_names_of_this_machine_are_answered() {
+    fn loopback_accepts_local_names_only() {
         let access = access("127.0.0.1:8080", None);
         for host in [
             "localhost:8080",
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_comes_by_header_cookie_or_once_by_address() {
+    fn token_by_header_cookie_or_address() {
         let access = access("0.0.0.0:8080", Some("correct-horse"));
         let with =
             |uri: &str, header: Option<(HeaderName, &str)>| decide(&access, uri, header.as_slice());

@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_that_takes_all_places_makes_room_for_another() {
+    fn address_holding_all_places_yields() {
         let connection_limit = ConnectionLimit::new(4);
         let [mut first, mut second, mut third, mut other] =
             ["10.0.0.9", "10.0.0.9", "10.0.0.9", "10.0.0.2"]
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn an_ipv6_network_counts_as_one_address_and_of_equals_the_oldest_leaves() {
+    fn ipv6_network_is_one_address() {
         let connection_limit = ConnectionLimit::new(3);
         let [mut a, mut b, mut c] = ["2001:db8::1", "2001:db8:0:1::1", "2001:db8:0:1::2"]
             .map(|from| admit(&connection_limit, from).unwrap());
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_is_answered_stays_and_leaves_its_place() {
+    fn answered_connection_is_kept() {
         let connection_limit = ConnectionLimit::new(2);
         let mut kept = ["10.0.0.2", "10.0.0.2"].map(|from| admit(&connection_limit, from).unwrap());
         kept.iter().for_each(|admitted| admitted.slot.keep());

@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_their_own_and_lead_back() {
+    fn schema_names_round_trip() {
         for schema in SchemaName::ALL {
             assert_eq!(SchemaName::from_name(schema.as_str()), Some(schema));
         }
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_viewers_draw_has_the_fields_of_the_published_schemas() {
+    fn viewer_channels_match_published_schemas() {
         for (schema, fields) in [
             (SchemaName::SceneUpdate, &["deletions", "entities"][..]),
             (

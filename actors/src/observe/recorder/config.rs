@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_alone_or_a_table_will_do() {
+    fn directory_or_table_is_accepted() {
         let defaults = RecordConfig::new("/log");
         assert_eq!(read("record = \"/log\""), Ok(defaults.clone()));
         let expected = RecordConfig {

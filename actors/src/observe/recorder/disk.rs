@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_files_of_the_node_give_way_and_no_others() {
+    fn only_oldest_node_files_removed() {
         let dir = tempfile::tempdir().unwrap();
         let at = |s: u64| Timestamp(1_732_154_400_000_000 + s * 1_000_000);
         for (node, second) in [
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_is_nearly_full_is_left_alone() {
+    fn nearly_full_disk_stays_untouched() {
         let dir = tempfile::tempdir().unwrap();
         let error = create(dir.path(), &name("cav"), Timestamp(0), u64::MAX).unwrap_err();
         assert_eq!(error.kind(), io::ErrorKind::StorageFull);

@@ -403,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_drawn_once_however_many_reports_it_makes() {
+    fn frame_is_drawn_once() {
         let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
         let mut messages = Messages::default();
         let mut write =
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn the_last_drawing_of_vehicles_has_all_that_report() {
+    fn last_drawing_includes_all_reports() {
         let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
         let mut messages = Messages::default();
         for round in 20..40 {

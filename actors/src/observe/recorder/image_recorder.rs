@@ -139,7 +139,7 @@ mod tests {
     /// A Pi without a real-time clock starts with a time years ago: viewers look for the vehicle's
     /// pose at the picture's time.
     #[test]
-    fn a_picture_is_dated_as_reports_are() {
+    fn picture_uses_cell_time() {
         let clock = CellClock::default();
         clock.show(ClockReading {
             offset_us: 5_000_000,
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_come_as_often_as_asked_for_are_all_recorded_but_one() {
+    fn requested_frame_rate_is_recorded() {
         let (mut recorder, recorded) = recorder(CellClock::default(), Duration::from_millis(200));
         for frame in 1..=20 {
             let jitter_us = [0, 15_000, -15_000][frame as usize % 3];

@@ -143,7 +143,7 @@ mod tests {
     use ecod::aggregator::FusionConfig;
 
     #[test]
-    fn a_file_that_holds_nothing_is_not_left_behind() {
+    fn empty_file_is_removed() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("cav.mcap");
         let identity = LogIdentity::new(

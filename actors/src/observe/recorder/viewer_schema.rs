@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn viewers_can_read_the_schema_of_every_channel() {
+    fn every_channel_schema_is_readable() {
         for schema in SchemaName::ALL {
             let json = schema.json_schema().to_value();
             check(schema.as_str(), &json);
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_said_to_be_in_base64_and_levels_have_names() {
+    fn schema_states_encoding_and_levels() {
         let image = SchemaName::CompressedImage.json_schema().to_value();
         assert_eq!(image["properties"]["data"]["contentEncoding"], "base64");
         let log = SchemaName::Log.json_schema().to_value();
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn what_may_be_null_says_so() {
+    fn nullable_fields_are_declared() {
         let report = SchemaName::ObjectReport.json_schema().to_value();
         let pose = &report["properties"]["pose"];
         assert_eq!(

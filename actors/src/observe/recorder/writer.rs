@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_holds_for_nodes_that_never_fill_a_file_and_makes_room_on_a_full_disk() {
+    fn disk_limit_includes_small_files() {
         let directory = tempfile::tempdir().unwrap();
         for second in 0..40 {
             let (path, _) =
@@ -357,7 +357,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_begins_after_a_change_of_settings_has_those_of_then() {
+    fn new_file_has_current_settings() {
         let directory = tempfile::tempdir().unwrap();
         let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn a_change_of_settings_that_finds_the_queue_full_is_written_at_its_place() {
+    fn settings_change_survives_full_queue() {
         let directory = tempfile::tempdir().unwrap();
         let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
@@ -453,7 +453,7 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_that_fills_up_while_a_file_is_written_ends_the_file_in_order() {
+    fn full_disk_closes_file_cleanly() {
         let directory = tempfile::tempdir().unwrap();
         let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
@@ -484,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_disk_did_not_take_is_counted_as_dropped_and_told_of_in_the_next_file() {
+    fn unwritten_entries_count_as_dropped() {
         let directory = tempfile::tempdir().unwrap();
         let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);
@@ -523,7 +523,7 @@ mod tests {
 
     /// The number of a round is for files that start later; it does not cause a new file.
     #[test]
-    fn files_and_gaps_bear_the_time_of_what_is_written() {
+    fn entries_keep_their_time() {
         let directory = tempfile::tempdir().unwrap();
         let counters = Arc::new(Counters::default());
         let mut writer = writer(in_directory(directory.path()), &counters);

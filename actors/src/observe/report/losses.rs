@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn losses_of_all_runs_add_up() {
+    fn losses_of_runs_add_up() {
         let mut losses = Losses::default();
         let runs = [1, 2].map(|number| Some(Uuid::from_u128(number)));
         assert!(!losses.are_known());

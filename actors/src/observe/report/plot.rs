@@ -274,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn axes_have_a_handful_of_round_ticks() {
+    fn axes_have_few_round_ticks() {
         for (max, expected) in [(1.0, 0.2), (0.07, 0.02), (3600.0, 1000.0), (59.0, 10.0)] {
             assert!((step(max) - expected).abs() < 1e-12, "{max}: {}", step(max));
             assert!((3..=8).contains(&ticks(step(max), max).count()), "{max}");
@@ -283,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn a_logarithmic_axis_goes_from_power_to_power() {
+    fn logarithmic_axis_spans_powers() {
         let scale = Scale::new(Axis::Logarithmic, [0.0, 0.3, 45.0, 941.0].into_iter());
         assert_eq!(scale.ticks(), [0.1, 1.0, 10.0, 100.0, 1000.0]);
         assert_eq!(
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_is_well_formed_whatever_it_is_given() {
+    fn any_plot_is_well_formed() {
         let curve = |points: Vec<(f64, f64)>| Curve {
             name: "<a & b>".into(),
             points,

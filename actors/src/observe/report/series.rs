@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_and_distributions_end_at_the_largest() {
+    fn quantiles_end_at_maximum() {
         let values = [3.0, 1.0, 2.0];
         assert_eq!(
             [0.0, 0.5, 1.0].map(|share| quantile(&values, share)),

@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_parts_of_one_vehicle_leave_room_for_other_sources() {
+    fn vehicle_parts_leave_room() {
         let rejects = CountsBySource::default();
         for part in 0..1000 {
             rejects.count(ShedReason::StatusThrottled, &format!("mallory--{part}"));
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn sources_are_told_apart_until_there_are_too_many() {
+    fn excess_sources_share_one_count() {
         let shed = CountsBySource::default();
         assert!(shed.count(ShedReason::ReaderSlow, "gauss"));
         for source in 0..2 * MAX_TRACKED_SOURCES {

@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_burst_is_no_flood_and_a_flood_stays_one_until_it_pauses() {
+    fn flood_lasts_until_pause() {
         let floods = Floods::default();
         let at = |ms: u64| Timestamp(1_000_000_000 + ms * 1000);
         let burst = (0..1000).any(|ms| floods.is_flood("reports", "euclid", at(ms)));
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn many_sources_take_no_more_memory() {
+    fn many_sources_use_bounded_memory() {
         let floods = Floods::default();
         let name = |number: usize| format!("node-{number}");
         let first = (0..MAX_SOURCES).any(|n| floods.is_flood(1, &name(n), Timestamp(0)));

@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_of_a_principal_gives_way_and_others_do_not() {
+    fn principals_oldest_is_cut_first() {
         let backlog = Backlog::new(0);
         let (honest, mut honest_cut) = backlog.open(Some("euclid".into()));
         honest.set_unread(MIB, Timestamp(1));
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_of_all_gives_way_beyond_the_ceiling() {
+    fn ceiling_cuts_oldest_of_all() {
         let backlog = Backlog::new(0);
         let mut slots: Vec<_> = (0..20)
             .map(|n| backlog.open(Some(format!("v{n}").into())))
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_packet_always_has_room() {
+    fn largest_packet_always_fits() {
         let backlog = Backlog::new(64 * MIB);
         let (leader, mut cut) = backlog.open(Some("edge".into()));
         leader.set_unfinished(64 * MIB, Timestamp(0));
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn who_ends_packets_is_not_the_oldest_however_much_it_sends() {
+    fn finished_packets_reset_sender_age() {
         let backlog = Backlog::new(0);
         let [(sender, mut sender_cut), (reader, mut reader_cut)] =
             [0, 1].map(|_| backlog.open(Some("gauss".into())));
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_connection_that_counts_alone_is_bounded_too() {
+    fn connection_without_principal_is_bounded() {
         let backlog = Backlog::new(0);
         let (slot, mut cut) = backlog.open(None);
         slot.set_unread(MAX_BYTES_EACH, Timestamp(0));

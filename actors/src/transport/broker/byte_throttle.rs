@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn connections_of_one_principal_share_a_rate() {
+    fn connections_of_principal_share_rate() {
         let mib = |bytes: usize| bytes as f64 / f64::from(1 << 20);
         let long = mib(sent(false, 64 * 1024, 20));
         let short = mib(sent(false, 64 * 1024, 10));

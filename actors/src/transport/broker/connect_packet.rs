@@ -124,7 +124,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn other_protocol_levels_are_told_from_malformed_packets() {
+    async fn unknown_protocol_is_not_malformed() {
         for (level, name) in [(0x84, "MQTT"), (0x83, "MQIsdp"), (6, "MQTT"), (0, "MQTT")] {
             let body = [
                 &[0, name.len() as u8],
@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn clients_that_name_themselves_are_told_from_those_that_do_not() {
+    async fn clients_without_id_are_recognised() {
         let v4 = |id: &str| {
             [
                 &b"\0\x04MQTT\x04\x02\0\x3c\0"[..],

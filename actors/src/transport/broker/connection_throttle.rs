@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn one_address_uses_up_its_own_share_only() {
+    fn address_uses_only_its_share() {
         let throttle = throttle(3, at(0));
         let admitted = |address, ms| {
             (0..9)
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn where_too_many_wait_the_oldest_gives_way_to_the_newest() {
+    fn newest_displaces_oldest_waiting() {
         let throttle = throttle(100, at(0));
         let other = throttle.admit(from("10.0.0.2"), at(0)).unwrap();
         let mut held: Vec<_> = (0..40)
@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn however_many_addresses_wait_the_oldest_gives_way() {
+    fn many_waiting_addresses_displace_oldest() {
         let throttle = throttle(100, at(0));
         let mut held: Vec<_> = (0..MAX_PENDING as u32 + 10)
             .filter_map(|n| throttle.admit(ClientOrigin::Remote(IpAddr::V4(n.into())), at(0)))
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn an_address_from_which_a_client_has_logged_in_has_more() {
+    fn address_with_login_has_more() {
         let throttle = throttle(100, clock::now());
         let flood = |ms: u64| {
             let now = clock::now() + Duration::from_millis(ms);
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn this_machines_are_not_throttled_but_few_wait() {
+    fn waiting_local_connections_are_few() {
         let throttle = throttle(100, at(0));
         let mut held: Vec<_> = (0..MAX_PENDING)
             .filter_map(|_| throttle.admit(ClientOrigin::Local, at(0)))
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn any_number_of_addresses_costs_bounded_memory() {
+    fn many_addresses_use_bounded_memory() {
         let throttle = throttle(100, at(0));
         for n in 0..2 * MAX_ADDRESSES as u32 {
             drop(throttle.admit(ClientOrigin::Remote(IpAddr::V4(n.into())), at(0)));

@@ -101,7 +101,7 @@ mod tests {
     use crate::transport::pki::{Authority, Credentials, TlsConfig};
 
     #[test]
-    fn a_client_that_left_is_named_once_when_it_is_revoked_and_only_the_latest_are_kept() {
+    fn revoked_client_is_named_once() {
         let directory = tempfile::tempdir().unwrap();
         let [lot, gauss, euclid] = ["lot", "gauss", "euclid"].map(NodeName::from_static);
         let mut authority = Authority::init(directory.path(), &lot, clock::now()).unwrap();

@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thread_hangs_when_it_misses_many_looks_in_a_row() {
+    fn missed_checks_mean_hanging_thread() {
         let mut heartbeat = ThreadHeartbeat::default();
         let beats = heartbeat.beats();
         let mut lost_at = |from_ms: u64, step_ms: u64| {

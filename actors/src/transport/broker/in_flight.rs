@@ -136,7 +136,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_payload_counts_until_its_last_copy_is_gone() {
+    fn payload_counts_until_last_drop() {
         let in_flight = InFlight::default();
         let gauss = Arc::<str>::from("gauss");
         let euclid = Arc::<str>::from("euclid");
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn all_wait_while_many_send_too_much() {
+    fn all_wait_above_total_limit() {
         let in_flight = InFlight::default();
         let names = (0..40).map(|n| Arc::<str>::from(format!("v{n}")));
         let _held: Vec<_> = names

@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_messages_give_way_and_no_packet_is_torn() {
+    fn oldest_messages_drop_whole() {
         let mut queue = OutboundQueue::new(3);
         assert_eq!(queue.push(&message(1, 100)).unwrap(), 0);
         queue.advance(10);
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_that_passes_as_it_comes_is_whole() {
+    fn streamed_map_stays_whole() {
         let mut queue = OutboundQueue::new(3);
         let map = message(1, 9_000_000);
         let mut sent = Vec::new();
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_are_few_and_the_newest_is_always_kept() {
+    fn queue_keeps_newest_within_limit() {
         let mut queue = OutboundQueue::new(100);
         queue.push(&message(0, 10)).unwrap();
         queue.advance(1);
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_that_nobody_reads_fill_the_queue() {
+    fn unread_answers_fill_queue() {
         let mut queue = OutboundQueue::new(10);
         let pushed = (0..100)
             .take_while(|_| queue.push(&[0xd0, 0]).is_ok())
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn a_queue_of_one_message_holds_the_newest_beside_what_is_begun() {
+    fn queue_of_one_keeps_newest() {
         let mut queue = OutboundQueue::new(1);
         queue.push(&message(1, 100)).unwrap();
         queue.advance(1);

@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn packets_are_found_however_the_bytes_arrive() {
+    fn split_bytes_give_whole_packets() {
         let long = [&[0x30, 0xc8, 0x01][..], &[7; 200]].concat();
         let stream = [&[0xd0, 0][..], &long, &[0x40, 2, 0, 1]].concat();
         for size in 1..=stream.len() {

@@ -376,7 +376,7 @@ mod tests {
     }
 
     #[test]
-    fn everyone_speaks_for_itself_and_the_elected_for_all() {
+    fn only_elected_publishes_for_others() {
         let permissions = permissions();
         let allows = |identity: &CertificateSubject, topic: &str| {
             permissions.allows(&with(identity), &format!("ecod/v1/lot/{topic}"), false, 0)
@@ -417,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn only_statuses_and_reputations_are_retained_whoever_asks() {
+    fn only_status_and_reputations_retained() {
         let permissions = permissions();
         let edge = with(&identity("edge", Role::Edge));
         let streams = [
@@ -444,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_is_not_as_large_as_a_map() {
+    fn report_limit_is_below_map() {
         let permissions = permissions();
         for principal in [with(&identity("edge", Role::Edge)), anyone()] {
             let allows = |topic: &str, bytes| {
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn a_status_is_not_as_large_as_a_report() {
+    fn status_limit_is_below_report() {
         let mut permissions = permissions();
         permissions.policy.limits = Limits::default();
         let allows = |topic: &str, bytes| {
@@ -489,7 +489,7 @@ mod tests {
     }
 
     #[test]
-    fn a_description_of_line_feeds_alone_may_be_published() {
+    fn line_feed_description_is_publishable() {
         let mut permissions = permissions();
         permissions.policy.limits = Limits::default();
         let description = CellDescription {
@@ -510,7 +510,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_takes_the_client_id_of_another() {
+    fn foreign_client_id_is_refused() {
         let euclid = identity("euclid", Role::Auto);
         let run = "0123456789abcdef0123456789abcdef";
         for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {

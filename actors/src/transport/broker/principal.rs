@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn connections_of_one_address_are_few_and_this_machines_are_not() {
+    fn remote_address_connections_are_limited() {
         let quota = ConnectionQuota::new(2);
         let take = |address: &str| quota.take(&at(address));
         let held = [take("10.0.0.1"), take("::ffff:10.0.0.1")];
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn programs_use_up_nothing_of_their_node() {
+    fn programs_use_no_node_quota() {
         let quota = ConnectionQuota::new(1);
         let node = at("10.0.0.1");
         let programs = at("10.0.0.1").programs();
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_count_by_principal_whatever_the_client_calls_itself() {
+    fn quota_follows_principal() {
         let principals = PrincipalRegistry::default();
         let port = |port| SocketAddr::from(([127, 0, 0, 1], port));
         let holders = ["10.0.0.1", "10.0.0.1", "10.0.0.2", "127.0.0.1", "127.0.0.1"].map(at);

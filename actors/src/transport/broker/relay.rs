@@ -292,7 +292,7 @@ mod tests {
 
     /// In a cut network both directions stand still; a slow client still reads or sends.
     #[test]
-    fn a_client_that_neither_reads_nor_sends_is_named_as_cut_off_and_another_as_slow() {
+    fn silent_and_slow_clients_differ() {
         let principal = Principal::new(None, Ipv4Addr::new(10, 0, 0, 7).into(), false);
         for (received, sent, kind) in [
             (0, 0, "overload"),

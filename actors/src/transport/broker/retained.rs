@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_and_bytes_are_bounded_and_what_is_there_may_change() {
+    fn retained_topics_are_bounded() {
         let mut index = index(2, 100);
         let now = Instant::now();
         assert!(
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn one_certificate_does_not_use_up_the_topics() {
+    fn one_certificate_cannot_fill_topics() {
         let mut index = index(1000, 1000);
         let now = Instant::now();
         let entries = (0..200)

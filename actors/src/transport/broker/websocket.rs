@@ -321,7 +321,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_page_connects_to_the_host_that_served_it_by_its_address() {
+    fn page_connects_to_serving_host() {
         let check = |origin: &str, host: &str| {
             let headers = [(ORIGIN, origin), (HOST, host)];
             let headers =

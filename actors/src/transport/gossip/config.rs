@@ -211,7 +211,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_are_valid_and_errors_name_the_key() {
+    fn defaults_are_valid_errors_name_key() {
         assert_eq!(MembershipConfig::default().validate(), Ok(()));
         for (toml, key) in [
             ("key = \"short\"", "key"),

@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn only_key_cell_sessions_and_counter_of_the_sealing_open_a_frame() {
+    fn frame_opens_with_sealing_context() {
         let cell = NodeName::from_static("lot-1");
         let key = CellKey::new("correct horse battery", &cell);
         let mut frame = b"headbody".to_vec();
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn sixty_four_digits_are_the_key_itself() {
+    fn sixty_four_digits_are_raw_key() {
         let cell = NodeName::from_static("lot-1");
         let digits = "0aF1".repeat(16);
         let mut frame = b"headbody".to_vec();
@@ -304,7 +304,7 @@ mod tests {
     }
 
     #[test]
-    fn key_files_are_trimmed_and_must_hold_a_key() {
+    fn key_files_are_validated() {
         let cell = NodeName::from_static("lot-1");
         let file = tempfile::NamedTempFile::new().unwrap();
         let config = MembershipConfig {

@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_slip_of_the_hand_is_found_by_its_tag_and_other_cells_are_not() {
+    fn mistyped_cell_is_found() {
         let own = NodeName::from_static("ux-lot");
         let found = |other: &'static str| {
             let other = NodeName::from_static(other);
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn invented_tags_are_not_searched_for_ever() {
+    fn invented_tags_end_search() {
         let mut cells = NearCells::default();
         let own = NodeName::from_static("lot");
         assert!(

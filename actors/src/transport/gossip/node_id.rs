@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_broker_on_the_loopback_of_another_machine_is_none() {
+    fn foreign_loopback_broker_is_ignored() {
         let id = |gossip: &str| NodeId {
             name: NodeName::from_static("euclid"),
             run: 1,

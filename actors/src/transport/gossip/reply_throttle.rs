@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_from_many_hosts_leaves_a_host_that_was_met_its_room() {
+    fn flood_leaves_verified_host_share() {
         let mut throttle = ReplyThrottle::new(Timestamp(0));
         throttle.know(address(7), Timestamp(0));
         assert_eq!(verified_beside_a_flood(&mut throttle, 7), 20);
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn the_hosts_with_room_of_their_own_are_bounded_and_so_is_the_room() {
+    fn verified_hosts_are_bounded() {
         let mut throttle = ReplyThrottle::new(Timestamp(0));
         (0..2 * MAX_KNOWN as u32)
             .for_each(|host| throttle.know(address(host), Timestamp(host.into())));

@@ -83,7 +83,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_seed_of_the_wrong_family_or_without_an_address_is_tried_on() {
+    async fn unusable_seed_is_retried() {
         let seeds = ["127.0.0.1:9", "[::1]:9", "no port"].map(str::to_owned);
         let mut unresolved = BTreeSet::from(["127.0.0.1:9".to_owned()]);
         let usual: SocketAddr = "127.0.0.1:9".parse().unwrap();

@@ -154,7 +154,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_group_that_could_not_be_joined_is_joined_later() {
+    async fn failed_multicast_join_is_retried() {
         let bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
         let socket = GossipSocket::bind(&MembershipConfig {
             bind,

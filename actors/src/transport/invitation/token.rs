@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_token_is_read_as_it_was_written_and_no_part_of_it_is() {
+    fn token_round_trips_only_whole() {
         let addresses = vec![
             "192.168.1.10:40000".parse().unwrap(),
             "[fe80::1]:40000".parse().unwrap(),

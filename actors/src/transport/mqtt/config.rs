@@ -207,7 +207,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_are_valid_and_errors_name_the_key() {
+    fn defaults_are_valid_errors_name_key() {
         MqttConfig::default().validate().unwrap();
         let error = MqttConfig {
             keep_alive_s: 0,
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn toml_is_read_and_passwords_are_never_shown() {
+    fn toml_is_read_and_passwords_hidden() {
         let text = "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
         let config: MqttConfig = toml::from_str(text).unwrap();
         assert_eq!(

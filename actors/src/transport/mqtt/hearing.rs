@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_end_of_a_stall_is_told_once() {
+    fn stall_end_is_reported_once() {
         let hearing = Hearing::default();
         assert!(!hearing.note());
         hearing.miss();

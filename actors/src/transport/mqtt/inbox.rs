@@ -505,7 +505,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_inbox_drops_and_counts_until_a_receiver_catches_up() {
+    fn full_inbox_drops_and_counts() {
         let counters = Arc::new(Counters::default());
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
@@ -558,7 +558,7 @@ mod tests {
     }
 
     #[test]
-    fn one_vehicle_that_floods_is_cut_down_and_counted_and_others_are_not() {
+    fn only_flooding_vehicle_is_limited() {
         let counters = Arc::new(Counters::default());
         let (inbox, taken) = counting(&counters, |message| match message {
             Incoming::Report { report, .. } => &report.node,
@@ -596,7 +596,7 @@ mod tests {
     }
 
     #[test]
-    fn statuses_of_one_node_beyond_measure_reach_nobody() {
+    fn excess_statuses_are_dropped() {
         let counters = Arc::new(Counters::default());
         let (inbox, taken) = counting(&counters, |message| match message {
             Incoming::Status { status, .. } => &status.node,

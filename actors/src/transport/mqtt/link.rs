@@ -461,7 +461,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waits_grow_to_the_bound_with_jitter_and_start_over_after_success() {
+    fn reconnect_wait_grows_until_success() {
         let config = MqttConfig {
             retry_min_ms: 50,
             retry_max_ms: 400,

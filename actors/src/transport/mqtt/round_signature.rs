@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signature_comes_off_as_it_was_put_on_and_the_round_stays_readable() {
+    fn signed_round_stays_readable() {
         let verdicts = Verdicts::new(
             &Epoch::new(7, NodeName::from_static("edge")),
             88,

@@ -293,7 +293,7 @@ mod tests {
     use crate::transport::pki::Authority;
 
     #[test]
-    fn a_clock_before_or_after_the_certificate_is_told_with_its_remedy() {
+    fn clock_outside_certificate_names_remedy() {
         let name = NodeName::from_static("edge");
         let cell = NodeName::from_static("lot");
         let month_us = 30 * 86_400 * 1_000_000;
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signed_round_is_its_aggregators_and_any_change_shows() {
+    fn altered_signed_round_is_refused() {
         let cell = NodeName::from_static("lot");
         let [edge, euclid] = ["edge", "euclid"].map(NodeName::from_static);
         let directory = tempfile::tempdir().unwrap();
@@ -415,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn only_key_cell_topic_and_payload_of_the_sealing_open_an_envelope() {
+    fn envelope_opens_with_sealing_context() {
         let key_of_cell = key("correct horse battery", "lot-1");
         let envelope = key_of_cell.sign("a/b", b"payload");
         assert_eq!(key_of_cell.verify(b"a/b", &envelope), Some(&b"payload"[..]));

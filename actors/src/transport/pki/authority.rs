@@ -545,7 +545,7 @@ mod tests {
     use crate::platform::clock;
 
     #[test]
-    fn a_ca_is_made_once_and_its_keys_are_for_its_owner_only() {
+    fn ca_is_made_once() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
@@ -569,7 +569,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ca_that_was_left_half_made_can_be_made_again() {
+    fn half_made_ca_is_remade() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let obstacle = directory.path().join("issued.tmp");
@@ -589,7 +589,7 @@ mod tests {
     }
 
     #[test]
-    fn commands_that_run_at_once_lose_nothing_of_each_other() {
+    fn concurrent_commands_lose_no_entries() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(NodeName::from_static);
@@ -613,7 +613,7 @@ mod tests {
     }
 
     #[test]
-    fn a_register_with_one_wrong_byte_is_told_and_not_used() {
+    fn altered_register_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
@@ -638,7 +638,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_was_issued_can_be_revoked_and_once() {
+    fn issued_certificate_is_revoked_once() {
         let directory = tempfile::tempdir().unwrap();
         let cell = NodeName::from_static("lot-1");
         let edge = NodeName::from_static("edge");

@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn all_connections_to_a_revoked_broker_end_as_soon_as_the_list_is_read() {
+    async fn revoked_broker_loses_all_connections() {
         let directory = tempfile::tempdir().unwrap();
         let edge = NodeName::from_static("edge");
         let (mut authority, credentials) = credentials(directory.path());
@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broker_is_trusted_until_its_certificate_is_revoked_or_has_expired() {
+    fn broker_is_trusted_until_expiry() {
         let directory = tempfile::tempdir().unwrap();
         let (mut authority, credentials) = credentials(directory.path());
         let [edge, brief] = ["edge", "brief"].map(NodeName::from_static);

@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_city_has_a_list_where_the_cell_has_one() {
+    fn revocation_lists_come_in_pairs() {
         let read = |cell: &str, city: &str| {
             let text = format!(
                 "ca = \"a\"\ncertificate = \"b\"\nkey = \"c\"\n{cell}\n[city]\nca = \"d\"\n{city}"

@@ -516,7 +516,7 @@ mod tests {
     use crate::transport::pki::Authority;
 
     #[test]
-    fn a_revocation_list_without_a_list_is_refused_and_the_one_before_stays_in_use() {
+    fn empty_revocation_list_keeps_previous() {
         let directory = tempfile::tempdir().unwrap();
         let edge = NodeName::from_static("edge");
         let mut authority = Authority::init(
@@ -562,7 +562,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_that_is_to_be_more_than_its_certificate_allows_is_told_both() {
+    fn role_beyond_certificate_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let euclid = NodeName::from_static("euclid");
         let mut authority = Authority::init(

@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_an_aggregator_signed_is_its_evidence() {
+    fn evidence_needs_signature_of_aggregator() {
         let (_directory, mut authority) = authority();
         let now = clock::now();
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, now);
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn no_bit_of_a_signed_share_can_be_changed() {
+    fn any_changed_bit_breaks_signature() {
         let (_directory, mut authority) = authority();
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, clock::now());
         let LedgerSignature {
@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn evidence_goes_with_a_revoked_certificate_and_stays_with_an_expired_one() {
+    fn revocation_removes_evidence_expiry_keeps() {
         let (_directory, mut authority) = authority();
         let now = clock::now();
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, now);

@@ -239,7 +239,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rights_are_read_as_they_are_written_and_otherwise_not() {
+    fn rights_round_trip() {
         let rights = Rights {
             priority: 7,
             ..Rights::from(Role::Auto)
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_of_a_version_that_wrote_no_rights_still_lets_a_broker_lead() {
+    fn certificate_without_rights_may_lead() {
         let broker = || rcgen::SanType::DnsName(BROKER_NAME.try_into().unwrap());
         let uri = |text: &str| rcgen::SanType::URI(text.try_into().unwrap());
         assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::ALL);

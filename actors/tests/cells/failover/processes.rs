@@ -82,14 +82,14 @@ const CA: &str = "pki";
 
 /// SIGKILL for the edge's process: its vehicles go on at once, and hand back when it has started again.
 #[test]
-fn vehicles_go_on_when_the_process_of_the_edge_is_killed() {
+fn vehicles_survive_edge_kill() {
     let directory = tempfile::tempdir().unwrap();
     edge_is_killed(&directory);
 }
 
 /// The same with TLS between all: a broken connection and a refused port say as much as they do without.
 #[test]
-fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
+fn certified_vehicles_survive_edge_kill() {
     let directory = tempfile::tempdir().unwrap();
     Authority::init(
         &directory.path().join(CA),
@@ -103,7 +103,7 @@ fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
 /// A second run under the name of a running vehicle takes no part: it says why, and ends by itself with a code of its
 /// own. Neither its coming nor its going touches the lead or costs a map.
 #[test]
-fn a_second_process_of_a_name_ends_and_the_leader_stays() {
+fn second_process_of_name_exits() {
     let directory = tempfile::tempdir().unwrap();
     let _logs = Logs(directory.path());
     let seed = free_gossip_address();

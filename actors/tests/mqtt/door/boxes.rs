@@ -49,7 +49,7 @@ async fn shown(cell: &Cell, program: &Program, name: &str, viewer: &str, contrib
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn boxes_at_the_door_of_any_node_are_on_the_map_of_all() {
+async fn boxes_reach_all_maps() {
     let cell = Cell::of_four().await;
     let beside = Program::connect("yolo", cell.door("euclid"), &[]).await;
     shown(&cell, &beside, "euclid--yolo", "noether", "euclid").await;
@@ -59,7 +59,7 @@ async fn boxes_at_the_door_of_any_node_are_on_the_map_of_all() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_with_a_certificate_and_no_node_reports_boxes() {
+async fn certified_vehicle_reports_without_node() {
     let mut cell = Cell::with_certificates();
     cell.start("edge", ecod::wire::Role::Edge, |_| ()).await;
     cell.start("euclid", ecod::wire::Role::Cav, |_| ()).await;
@@ -73,7 +73,7 @@ async fn a_vehicle_with_a_certificate_and_no_node_reports_boxes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn boxes_that_cannot_be_used_are_refused_or_counted_with_the_reason() {
+async fn unusable_boxes_name_reason() {
     let cell = Cell::of_four().await;
     let program = Program::connect("yolo", cell.door("euclid"), &["nodes/euclid/clients"]).await;
     let name = "euclid--yolo";

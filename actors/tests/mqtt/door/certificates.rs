@@ -11,7 +11,7 @@ use crate::door::courses::{leaders, planners};
 use crate::door::reported;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn with_certificates_programs_get_the_maps_of_their_node_through_a_kill_and_a_handover() {
+async fn programs_with_certificates_survive_handover() {
     let mut cell = Cell::with_certificates().and_four(|_| ()).await;
     let planners = planners(&cell, &["gauss", "noether", "euclid"]).await;
     let lidar = cell.program("lidar", "euclid", &[]).await;
@@ -37,7 +37,7 @@ async fn with_certificates_programs_get_the_maps_of_their_node_through_a_kill_an
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_with_the_certificate_of_another_node_says_nothing() {
+async fn foreign_certificate_cannot_publish() {
     let mut cell = Cell::with_certificates();
     for (name, role) in [
         ("edge", Role::Edge),
@@ -75,7 +75,7 @@ async fn a_program_with_the_certificate_of_another_node_says_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_flood_with_the_leaders_certificate_costs_none_of_its_maps() {
+async fn certified_flood_delays_no_map() {
     let mut cell = Cell::with_certificates();
     for (name, role) in [("edge", Role::Edge), ("euclid", Role::Cav)] {
         cell.start(name, role, |_| ()).await;

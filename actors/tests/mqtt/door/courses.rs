@@ -31,7 +31,7 @@ pub(crate) fn leaders<const N: usize>(names: [&str; N]) -> BTreeSet<String> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_planned_handover_gives_every_program_the_maps_of_its_node() {
+async fn planned_handover_keeps_maps_complete() {
     let mut cell = Cell::new();
     for (name, role, priority) in [
         ("gauss", Role::Auto, 200),
@@ -85,7 +85,7 @@ fn votes_of(program: &Program, leader: &str, voter: &str) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn verdicts_reputations_and_statuses_go_on_at_the_doors_when_the_leader_is_killed() {
+async fn outputs_survive_leader_kill() {
     let mut cell = Cell::of_four_with(|config| {
         config.fusion.vote.weighted.freshness_s = 0.2;
         config.reputations.publish_period_s = 0.1;
@@ -189,7 +189,7 @@ async fn verdicts_reputations_and_statuses_go_on_at_the_doors_when_the_leader_is
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_without_a_node_may_be_there_before_the_leader() {
+async fn nodeless_vehicle_may_precede_leader() {
     let mut cell = Cell::new();
     cell.start("edge", Role::Edge, |config| config.election.join_ms = 3000)
         .await;
@@ -208,7 +208,7 @@ async fn a_vehicle_without_a_node_may_be_there_before_the_leader() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_vehicle_without_a_node_may_have_its_status_as_last_will() {
+async fn nodeless_vehicle_leaves_last_will() {
     let mut cell = Cell::new();
     cell.start("edge", Role::Edge, |_| ()).await;
     cell.served_by("edge").await;
@@ -237,7 +237,7 @@ async fn a_vehicle_without_a_node_may_have_its_status_as_last_will() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
+async fn endless_names_leave_status_room() {
     let mut cell = Cell::new();
     cell.start("edge", Role::Edge, |_| ()).await;
     cell.served_by("edge").await;
@@ -284,7 +284,7 @@ async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_the_cell_would_not_use_is_refused_at_the_door() {
+async fn unusable_messages_are_refused() {
     let mut cell = Cell::new();
     cell.start("edge", Role::Edge, |config| {
         config.fusion.algorithms = Algorithms::Pace;
@@ -331,7 +331,7 @@ async fn what_the_cell_would_not_use_is_refused_at_the_door() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn behind_mosquitto_programs_get_the_maps_of_their_node_also_when_the_leader_is_killed() {
+async fn mosquitto_maps_survive_leader_kill() {
     let mosquitto = Mosquitto::start();
     let mut cell = Cell::new();
     for (name, role, priority) in [

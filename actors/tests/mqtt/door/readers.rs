@@ -17,7 +17,7 @@ const MEGABYTES: usize = 40;
 const MAX_GROWN_KIB: u64 = 28 * 1024;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn programs_that_never_read_cost_their_node_little_memory_and_others_no_map() {
+async fn slow_programs_cost_bounded_memory() {
     let node = Node::start();
     let door = node.door().await;
     let planner = Program::connect("planner", door, &["global_detections"]).await;

@@ -100,7 +100,7 @@ async fn edge() -> (Cell, SocketAddr) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_page_takes_part_as_any_program() {
+async fn page_works_like_any_program() {
     let (cell, door) = edge().await;
     let mut page = page(door).await;
     // Packets need not end where messages do.
@@ -155,7 +155,7 @@ async fn a_page_takes_part_as_any_program() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_page_of_another_site_is_refused_with_the_reason() {
+async fn foreign_page_is_refused() {
     let (cell, door) = edge().await;
     for origin in ["https://evil.example", "null"] {
         let (status, text) = open(
@@ -180,7 +180,7 @@ async fn a_page_of_another_site_is_refused_with_the_reason() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_browser_at_a_door_is_told_that_no_page_is_there() {
+async fn browser_gets_explanation() {
     let (cell, door) = edge().await;
     let mut browser = TcpStream::connect(door).await.unwrap();
     browser
@@ -212,7 +212,7 @@ async fn a_browser_at_a_door_is_told_that_no_page_is_there() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn messages_that_are_no_mqtt_end_the_connection() {
+async fn non_mqtt_messages_end_connection() {
     let (cell, door) = edge().await;
     let ends = |messages: Vec<Message>| async move {
         let mut page = page(door).await;

@@ -10,7 +10,7 @@ use ractor::{Actor, call};
 use crate::gateway::cell::until;
 
 #[tokio::test]
-async fn a_busy_port_is_an_answer_and_the_actor_goes_on() {
+async fn busy_port_is_reported() {
     // An address of its own: on another a port that was let go may be somebody else's at once.
     let own = SocketAddr::from(([127, 0, 21, 1], 0));
     let broker = Box::new(EmbeddedBroker::new(BrokerConfig::default()));

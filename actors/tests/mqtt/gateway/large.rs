@@ -40,7 +40,7 @@ async fn next_map(node: &mut Node) -> Arc<GlobalMap> {
 }
 
 #[tokio::test]
-async fn a_follower_gets_the_map_of_a_cell_with_16384_known_locations() {
+async fn map_with_16384_landmarks_arrives() {
     let (_broker, address) = embedded();
     for encoding in [Encoding::Json, Encoding::Cbor] {
         let mqtt = MqttConfig {
@@ -62,7 +62,7 @@ async fn a_follower_gets_the_map_of_a_cell_with_16384_known_locations() {
 }
 
 #[tokio::test]
-async fn a_map_beyond_the_limit_is_counted_and_told_of_and_costs_no_link() {
+async fn oversized_map_is_reported() {
     let mqtt = MqttConfig {
         max_map_bytes: 4096,
         ..MqttConfig::default()
@@ -86,7 +86,7 @@ async fn a_map_beyond_the_limit_is_counted_and_told_of_and_costs_no_link() {
 }
 
 #[tokio::test]
-async fn the_embedded_broker_cuts_off_who_sends_more_than_its_own_limit() {
+async fn oversized_packet_disconnects_client() {
     let mut broker = EmbeddedBroker::new(BrokerConfig {
         max_packet_bytes: Some(100_000),
         ..BrokerConfig::default()
@@ -106,7 +106,7 @@ async fn the_embedded_broker_cuts_off_who_sends_more_than_its_own_limit() {
 }
 
 #[tokio::test]
-async fn a_flawed_map_is_counted_a_flawed_entry_is_left_out_and_good_maps_go_on() {
+async fn flawed_entry_is_dropped() {
     let (_broker, address) = embedded();
     let mqtt = MqttConfig {
         encoding: Encoding::Cbor,

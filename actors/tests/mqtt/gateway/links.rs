@@ -41,7 +41,7 @@ async fn settle(receiver: &mut Node, sender: &Node) {
 }
 
 #[tokio::test]
-async fn reports_and_maps_pass_the_embedded_broker_in_both_versions_and_encodings() {
+async fn embedded_broker_relays_versions_and_encodings() {
     let (_broker, address) = embedded();
     for version in [MqttVersion::V311, MqttVersion::V5] {
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
@@ -59,7 +59,7 @@ async fn reports_and_maps_pass_the_embedded_broker_in_both_versions_and_encoding
 }
 
 #[tokio::test]
-async fn reports_and_maps_pass_mosquitto_in_both_versions() {
+async fn mosquitto_relays_both_versions() {
     let broker = Mosquitto::start();
     for version in [MqttVersion::V311, MqttVersion::V5] {
         report_and_map_pass(
@@ -120,7 +120,7 @@ async fn user_and_password_are_presented() {
 }
 
 #[tokio::test]
-async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
+async fn silent_publish_refusal_is_reported() {
     let permitted = Mosquitto::with_permissions("ecod", "hush", "topic readwrite ecod/v1/test/#");
     let denied = Mosquitto::with_permissions("ecod", "hush", "topic read ecod/v1/test/#");
     for version in [MqttVersion::V311, MqttVersion::V5] {
@@ -159,7 +159,7 @@ async fn a_node_that_may_not_publish_is_told_though_the_broker_keeps_silent() {
 }
 
 #[tokio::test]
-async fn a_node_that_stalls_after_its_login_accuses_no_broker() {
+async fn stall_accuses_no_broker() {
     let (_broker, address) = embedded();
     let mqtt = MqttConfig {
         connect_timeout_ms: 100,
@@ -175,7 +175,7 @@ async fn a_node_that_stalls_after_its_login_accuses_no_broker() {
 }
 
 #[tokio::test]
-async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
+async fn node_publishes_on_all_links_once() {
     let (_first, one) = embedded();
     let (_second, two) = embedded();
     let mut edge = Node::join(
@@ -230,7 +230,7 @@ async fn a_node_speaks_on_all_its_links_and_hears_itself_once() {
 }
 
 #[tokio::test]
-async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
+async fn reconnection_delivers_only_new_messages() {
     for version in [MqttVersion::V311, MqttVersion::V5] {
         let mut broker = Mosquitto::start();
         let address = broker.address();
@@ -260,7 +260,7 @@ async fn after_a_brokers_death_links_come_back_and_nothing_old_is_delivered() {
 }
 
 #[tokio::test]
-async fn a_restarted_embedded_broker_is_found_again() {
+async fn restarted_embedded_broker_is_reconnected() {
     let (mut broker, address) = embedded();
     let (mut edge, mut euclid) = edge_and_vehicle(&address, MqttConfig::default()).await;
     for seq in 1..=3 {
@@ -274,7 +274,7 @@ async fn a_restarted_embedded_broker_is_found_again() {
 }
 
 #[tokio::test]
-async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
+async fn observer_keeps_receiving_reports() {
     let (_broker, address) = embedded();
     let mut observer = Node::join(
         "recorder",
@@ -302,7 +302,7 @@ async fn an_observer_takes_reports_whoever_stops_looking_at_them() {
 }
 
 #[tokio::test]
-async fn a_broker_that_hangs_is_noticed_by_what_does_not_come_back() {
+async fn missing_echoes_reveal_hanging_broker() {
     for version in [MqttVersion::V311, MqttVersion::V5] {
         let broker = Mosquitto::start();
         let address = broker.address();

@@ -76,7 +76,7 @@ async fn mosquitto_v5() {
 }
 
 #[tokio::test]
-async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() {
+async fn living_namesakes_are_reported() {
     let (_broker, address) = embedded();
     let first = Node::follower("euclid", &address).await;
     let mut watcher = Node::follower("gauss", &address).await;
@@ -120,7 +120,7 @@ async fn two_living_nodes_of_one_name_are_told_of_each_other_and_do_not_argue() 
 }
 
 #[tokio::test]
-async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
+async fn last_will_keeps_connect_epoch() {
     let (mut broker, address) = embedded();
     let mut euclid = Node::follower("euclid", &address).await;
     euclid.send(GatewayMessage::PublishStatus {
@@ -146,7 +146,7 @@ async fn the_last_will_has_the_epoch_that_was_known_when_the_link_was_made() {
 }
 
 #[tokio::test]
-async fn a_will_that_fires_late_is_put_right() {
+async fn late_will_is_corrected() {
     let (_broker, address) = embedded();
     let euclid = Node::follower("euclid", &address).await;
     let mut watcher = Node::follower("gauss", &address).await;

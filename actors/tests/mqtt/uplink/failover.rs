@@ -76,7 +76,7 @@ fn longest_gap_in_cell(directory: &Path) -> Duration {
 /// SIGKILL for the leader's process: the region's gap is at most a second longer than the cell's. Epochs and rounds
 /// are in order, and the status is the present leader's. When the edge is back, so is the uplink.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_new_leader_goes_on_with_the_uplink() {
+async fn new_leader_continues_uplink() {
     for broker in Broker::both() {
         let subscriber = Subscriber::new(&broker.address());
         let directory = tempfile::tempdir().unwrap();

@@ -57,7 +57,7 @@ fn neighbour_objects(node: &NodeHandle) -> Vec<NeighbourObject> {
 /// An object of one cell is in the other's map, in the other's frame, with cell and age. Maps come faster, and the
 /// region's own maps have it once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {
+async fn neighbours_nearby_objects_are_mapped() {
     for broker in Broker::both() {
         let subscriber = Subscriber::new(&broker.address());
         let mut north_config = config("north", broker.address());

@@ -14,7 +14,7 @@ use crate::uplink::region::{Broker, Subscriber, assert_in_order};
 
 /// Without its region the cell goes on as before and says what is wrong; nothing waits for the region's return.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_goes_on_without_its_region_and_no_old_map_is_sent_later() {
+async fn cell_survives_region_outage() {
     for mut broker in Broker::both() {
         let subscriber = Subscriber::new(&broker.address());
         let node = start(config("north", broker.address())).await;
@@ -86,7 +86,7 @@ async fn a_cell_goes_on_without_its_region_and_no_old_map_is_sent_later() {
 
 /// A broker that hangs gets few maps, and what it passes on afterwards is too old for anybody.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_burst_of_old_maps_after_a_hang_reaches_nobody() {
+async fn delayed_maps_are_dropped() {
     let broker = Mosquitto::start();
     let subscriber = Subscriber::new(&broker.address());
     let node = start(config("north", broker.address())).await;
@@ -158,7 +158,7 @@ async fn a_burst_of_old_maps_after_a_hang_reaches_nobody() {
 
 /// An uplink that ends is started anew, and the last will of the one before does not stay.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_uplink_that_was_killed_is_started_anew() {
+async fn killed_uplink_is_restarted() {
     let broker = Mosquitto::start();
     let subscriber = Subscriber::new(&broker.address());
     let node = start(config("north", broker.address())).await;

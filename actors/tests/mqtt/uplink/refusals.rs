@@ -17,7 +17,7 @@ use crate::uplink::region::{Broker, Subscriber};
 
 /// A wrong password is told as such, with the broker's address, and costs the cell nothing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn wrong_credentials_are_told_and_right_ones_work() {
+async fn wrong_credentials_are_reported() {
     for broker in Broker::both_with_user("north", "correct horse") {
         let mut wrong = config("north", broker.address());
         wrong.uplink.user = Some("north".into());
@@ -77,7 +77,7 @@ async fn missing_permissions_are_told() {
 
 /// A cell without a place on Earth says so and tells the region nothing; with a place it begins.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_cell_without_origin_says_so() {
+async fn missing_origin_is_reported() {
     let broker = Mosquitto::start();
     let subscriber = Subscriber::new(&broker.address());
     let mut config = config("north", broker.address());
@@ -134,7 +134,7 @@ async fn a_cell_without_origin_says_so() {
 
 /// A broker that asks for certificates takes the node's own; one with another certificate than `ca` says is refused.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn certificates_of_both_sides_are_checked() {
+async fn both_certificates_are_checked() {
     let directory = tempfile::tempdir().unwrap();
     let name = NodeName::from_static("edge");
     let mut authority = Authority::init(

@@ -77,7 +77,7 @@ pub(crate) fn maps(directory: &Path) -> usize {
 
 /// SIGKILL costs what was not flushed, a second at most, and the rest is read.
 #[test]
-fn a_log_outlives_the_kill_of_its_process() {
+fn log_survives_process_kill() {
     let directory = tempfile::tempdir().unwrap();
     let dir = directory.path().join("edge");
     let mut process = edge(directory.path(), "");
@@ -103,7 +103,7 @@ fn a_log_outlives_the_kill_of_its_process() {
 
 /// A file that takes no more, as on a full disk, is given up for the next; the node goes on all the while.
 #[test]
-fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
+fn full_disk_costs_entries_only() {
     let directory = tempfile::tempdir().unwrap();
     let dir = directory.path().join("edge");
     let mut process = edge(directory.path(), "trap '' XFSZ; ulimit -f 24;");
@@ -143,7 +143,7 @@ fn a_disk_that_refuses_bytes_costs_entries_and_nothing_else() {
 /// A follower takes no reports of others unless told to, which shows in the log of the node, not only in what is
 /// missing afterwards.
 #[test]
-fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
+fn follower_notes_missing_reports() {
     for (role, says_so) in [(Role::Cav, true), (Role::Auto, false)] {
         let directory = tempfile::tempdir().unwrap();
         let _process = node_of(role, directory.path(), "");
@@ -163,7 +163,7 @@ fn a_vehicle_that_never_leads_says_that_it_records_no_reports_of_others() {
 
 /// A map log on a full disk, or on one that cannot be written, costs no map and no start.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
+async fn unwritable_log_delays_no_map() {
     for path in ["/dev/full", "/proc/maps.jsonl"] {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config("edge", Role::Edge, directory.path());
@@ -183,7 +183,7 @@ async fn a_map_log_that_cannot_be_written_holds_up_no_map() {
 
 /// A directory that cannot be made is counted and tried again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_directory_that_cannot_be_made_is_tried_again() {
+async fn failed_directory_is_retried() {
     let directory = tempfile::tempdir().unwrap();
     let mut config = config("edge", Role::Edge, directory.path());
     let dir = directory.path().join("blocked/log");

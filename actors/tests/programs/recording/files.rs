@@ -98,7 +98,7 @@ fn replay(inputs: &[&Path]) -> (i32, usize, String) {
 }
 
 #[test]
-fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
+fn readable_log_part_is_used() {
     let folder = TempDir::new().unwrap();
     let whole = log(1);
     let (code, lines, said) = replay(&[&file(&folder, "whole.mcap", &whole)]);
@@ -146,7 +146,7 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
 
 /// Reports that are fused in another way than they were are no replay: what cannot be known has to be said.
 #[test]
-fn a_log_whose_configuration_cannot_be_read_is_replayed_only_under_one_that_is_given() {
+fn unreadable_configuration_requires_given_one() {
     let folder = TempDir::new().unwrap();
     let unknown = r#"{"later_key": 1}"#;
     let config = file(&folder, "cell.toml", b"cell = \"cell\"\n");
@@ -194,7 +194,7 @@ fn a_log_whose_configuration_cannot_be_read_is_replayed_only_under_one_that_is_g
 }
 
 #[test]
-fn of_several_nodes_logs_in_one_directory_one_is_chosen() {
+fn one_log_is_chosen() {
     let folder = TempDir::new().unwrap();
     let logs = TempDir::new().unwrap();
     let [run, other_run] = [1, 2].map(|number| uuid::Uuid::from_u128(number).to_string());
@@ -254,7 +254,7 @@ fn of_several_nodes_logs_in_one_directory_one_is_chosen() {
 }
 
 #[test]
-fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() {
+fn later_configuration_is_used() {
     let folder = TempDir::new().unwrap();
     let one = file(&folder, "one.mcap", &log(1));
     let run = uuid::Uuid::from_u128(1).to_string();
@@ -284,7 +284,7 @@ fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() 
 }
 
 #[test]
-fn what_is_no_log_is_refused_by_name() {
+fn foreign_file_is_named() {
     let folder = TempDir::new().unwrap();
     let one = file(&folder, "one.mcap", &log(1));
     let lines = file(&folder, "lines.jsonl", b"{}\n");
@@ -301,7 +301,7 @@ fn what_is_no_log_is_refused_by_name() {
 }
 
 #[test]
-fn a_report_is_one_page_with_everything_in_it() {
+fn report_is_one_complete_page() {
     let folder = TempDir::new().unwrap();
     let log = file(&folder, "log.mcap", &log(1));
     let page = folder.path().join("report.html");
@@ -335,7 +335,7 @@ fn a_report_is_one_page_with_everything_in_it() {
 }
 
 #[test]
-fn the_doctor_says_what_is_broken_by_its_exit_code_and_as_json() {
+fn doctor_reports_by_exit_code() {
     let folder = TempDir::new().unwrap();
     let config = |name: &str, more: &str| {
         let text = format!(

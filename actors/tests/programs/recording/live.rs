@@ -33,7 +33,7 @@ fn view(port: u16, wanted: &[&str]) {
 
 /// A viewer is told of the channels; while its port is taken by another, the node records all the same.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn viewers_are_offered_what_is_recorded_and_drawn() {
+async fn viewers_receive_recorded_channels() {
     let directory = tempfile::tempdir().unwrap();
     let taken = TcpListener::bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
     let port = taken.local_addr().unwrap().port();

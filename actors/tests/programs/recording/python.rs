@@ -38,7 +38,7 @@ fn maps_by(python: &str, dir: &Path, state: &str) -> usize {
 
 #[test]
 #[ignore = "needs the Python package mcap, which `make recording-check` installs"]
-fn the_python_reader_reads_a_finished_log_and_one_of_a_killed_process() {
+fn python_reads_truncated_log() {
     let python = std::env::var("MCAP_PYTHON").unwrap_or("python3".into());
     let has_reader = Command::new(&python)
         .args(["-c", "import mcap"])

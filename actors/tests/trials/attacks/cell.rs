@@ -556,7 +556,7 @@ fn configuration(
 }
 
 #[test]
-fn a_map_is_false_that_says_more_than_honest_vehicles_have_seen() {
+fn unsupported_map_is_false() {
     let map = |aggregator: &str, label: &str, contributors: &str, objects: &str| {
         let text = format!(
             r#"{{"aggregator":"{aggregator}","landmarks":[{{"label":{label},"contributors":[{contributors}]}}],"objects":[{objects}]}}"#

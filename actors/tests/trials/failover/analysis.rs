@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clean_failover_costs_its_gap_and_nothing_else() {
+    fn clean_failover_costs_only_gap() {
         // The edge's last round comes at 900 ms; a takes over at 1050, b hears of it at 1060.
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let b = run("b", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1060, 20)]);
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gap_is_that_of_the_worst_measured_vehicle() {
+    fn gap_is_worst_vehicles() {
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let late = run("b", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 13, 1300, 18)]);
         let runs = [a, late];
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_round_published_by_both_leaders_of_a_handover_counts() {
+    fn round_published_during_handover_counts() {
         let twice = run("a", &[maps("a", 2, 1, 0, 10), maps(EDGE, 3, 10, 1000, 20)]);
         let verdict = judge(&[twice], &[phase(500, 2900, 1..=1, &["a"])]);
         assert_eq!((verdict.missed_rounds, verdict.stale_accepted), (1, 0));
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_of_a_superseded_leader_is_stale_in_the_run_that_knew_better() {
+    fn superseded_leaders_map_is_stale() {
         let fooled = run(
             "a",
             &[
@@ -309,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn a_node_without_maps_at_the_end_is_unrecovered() {
+    fn mapless_node_is_unrecovered() {
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let lost = run("b", &[maps(EDGE, 1, 1, 0, 10)]);
         assert!(judge(&[a.clone(), lost], &[phase(910, 2950, 1..=1, &["a", "b"])]).unrecovered);
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn two_leaders_are_right_in_two_components_and_wrong_in_one() {
+    fn two_leaders_need_two_components() {
         let a = run("a", &[maps("a", 2, 11, 0, 30)]);
         let edge = run(EDGE, &[maps(EDGE, 1, 11, 0, 30)]);
         let runs = [a, edge];
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn changes_that_no_fault_explains_and_changes_that_fail_to_come_are_counted() {
+    fn unexplained_failovers_are_counted() {
         let a = run(
             "a",
             &[

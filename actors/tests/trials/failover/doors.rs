@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_may_be_later_than_its_node_and_begin_later() {
+    fn program_may_lag_behind_node() {
         let node = run([(1, 100), (2, 200), (3, 350), (4, 450)]);
         let verdict = judge(&node, run([(2, 201), (3, 354), (4, 451)]));
         let delays = vec![1000, 4000, 1000];
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_ahead_does_not_hide_a_delay() {
+    fn fast_clock_hides_no_delay() {
         let verdict = judge(&run([(1, 100), (2, 200)]), run([(1, 99), (2, 201)]));
         assert_eq!(
             verdict.delays,
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_gets_no_more_maps_is_unserved_also_at_a_flooded_door() {
+    fn program_without_maps_is_unserved() {
         let node = run((1..=20).map(|round| (round, 100 * round)));
         let cut_short = run((1..=10).map(|round| (round, 100 * round + 1)));
         for flooded in [None, Some(&NodeName::from_static("a"))] {
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_that_a_program_lacks_or_has_twice_or_alone_are_wrong() {
+    fn missing_or_repeated_maps_wrong() {
         let node = run([(1, 100), (2, 200), (3, 300)]);
         assert_eq!(judge(&node, run([(1, 100), (3, 300)])).wrong, 1, "lost");
         assert_eq!(
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn the_time_of_a_line_has_microseconds() {
+    fn line_time_has_microseconds() {
         assert_eq!(
             time("1795440585.322362340"),
             Some(Timestamp(1_795_440_585_322_362))

@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_cut_short_by_a_kill_is_left_out() {
+    fn truncated_line_is_skipped() {
         let line = LINE.replace('\n', "");
         let log = file(&format!(
             "{line}\n{}\n{}",
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn maps_without_a_node_count_from_a_time_on() {
+    fn maps_lacking_node_are_counted() {
         let maps = LINE.replace('\n', "");
         let euclid = NodeName::from_static("euclid");
         let seen = maps.replace(
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_is_not_there_yet_holds_no_maps() {
+    fn missing_log_has_no_maps() {
         let missing = Path::new("no/such/log");
         assert!(accepted(missing).unwrap().is_empty());
         assert_eq!(last_accepted(missing).unwrap(), None);
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn the_standby_is_whom_the_leader_named_last() {
+    fn standby_is_last_named() {
         let lines = "INFO leadership position=leading epoch=edge@1\n\
                      INFO leadership position=leading epoch=edge@1 standby=v01\n\
                      INFO leadership position=following epoch=v01@2 standby=v02\n";

@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn programs_are_served_as_their_nodes_are() {
+    fn program_delays_are_limited() {
         let doors_of = |nodes, longer, later, wrong, unserved| {
             let longer_gap = Some(Duration::from_millis(longer));
             let doors = DoorVerdict {
@@ -447,7 +447,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_costs_its_node_little_and_its_reports_nothing() {
+    fn flood_costs_node_little() {
         let misses = |messages, grown_kib, unheard| {
             let flood = Some(FloodCost {
                 messages,
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn void_trials_excuse_lost_time_and_nothing_else() {
+    fn void_excuses_only_lost_time() {
         let slow = Verdict {
             gap: Some(Duration::from_secs(2)),
             unrecovered: true,
@@ -511,7 +511,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_may_be_missed_when_a_process_dies_but_not_when_it_hands_over() {
+    fn only_kill_may_miss_rounds() {
         let missed = Verdict {
             missed_rounds: 1,
             ..Verdict::default()
@@ -524,7 +524,7 @@ mod tests {
     }
 
     #[test]
-    fn the_file_has_the_promised_keys_and_whole_milliseconds() {
+    fn file_has_documented_keys() {
         let json = serde_json::to_value([outcome("edge_sigkill", Verdict::default())]).unwrap();
         let expected = serde_json::json!([{
             "scenario": "edge_sigkill", "nodes": 5, "trials": 1, "void": 0, "gap_ms": {"p50": 150, "p99": 150, "max": 150},

@@ -184,7 +184,7 @@ fn commands() -> [String; 3] {
 
 #[test]
 #[ignore = "needs root for network namespaces: make joining"]
-fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
+fn readme_commands_form_cell() {
     let _network = Bridged::new(3).unwrap();
     // The first is without the package, and told how to start its node.
     let machines @ [edge, gauss, euclid] = &[

@@ -205,7 +205,7 @@ fn assert_near<const N: usize>(got: [f64; N], expected: [f64; N], tolerance: f64
 }
 
 #[test]
-fn a_measurement_before_the_reference_time_is_moved_ahead_to_it() {
+fn early_measurement_is_extrapolated() {
     let moving = |delta_ms| {
         with(|object| {
             object.measurement_delta_time.0 = delta_ms;
@@ -229,7 +229,7 @@ fn a_measurement_before_the_reference_time_is_moved_ahead_to_it() {
 }
 
 #[test]
-fn velocity_may_be_polar_and_codes_of_it_are_no_values() {
+fn polar_velocity_is_accepted() {
     let velocity = |velocity| only(with(|object| object.velocity = velocity)).velocity_mps;
     assert_near(velocity(polar(1000, 900)).unwrap(), [0.0, 10.0], 1e-6);
     assert_near(velocity(polar(1000, 1800)).unwrap(), [-10.0, 0.0], 1e-6);
@@ -255,7 +255,7 @@ fn velocity_may_be_polar_and_codes_of_it_are_no_values() {
 }
 
 #[test]
-fn angles_are_tenths_of_degrees_and_accelerations_change_nothing() {
+fn angles_are_tenth_degrees() {
     let component = cdd::AccelerationComponent::new(
         cdd::AccelerationValue(150),
         cdd::AccelerationConfidence(102),
@@ -281,7 +281,7 @@ fn angles_are_tenths_of_degrees_and_accelerations_change_nothing() {
 }
 
 #[test]
-fn an_object_with_a_coordinate_out_of_range_is_left_out() {
+fn object_out_of_range_skipped() {
     let received = received(vec![
         at(-131_072, 0),
         at(0, 131_071),
@@ -297,7 +297,7 @@ fn an_object_with_a_coordinate_out_of_range_is_left_out() {
 }
 
 #[test]
-fn a_confidence_that_is_a_code_is_a_wide_covariance() {
+fn unavailable_confidence_widens_covariance() {
     let variance = |confidence| {
         only(with(|object| {
             object.position.x_coordinate.confidence.0 = confidence;
@@ -316,7 +316,7 @@ fn a_confidence_that_is_a_code_is_a_wide_covariance() {
 }
 
 #[test]
-fn the_error_of_the_reference_position_adds_to_that_of_each_object() {
+fn reference_error_adds_to_object_error() {
     let covariance = |ellipse| {
         let received = decode(&message(vec![object()], ellipse, None, TIME), &ORIGIN).unwrap();
         received.objects[0].covariance_m2.unwrap()
@@ -356,7 +356,7 @@ fn the_error_of_the_reference_position_adds_to_that_of_each_object() {
 }
 
 #[test]
-fn a_dimension_that_is_a_code_is_no_size() {
+fn unavailable_dimension_gives_no_size() {
     let size = |length, width| {
         let boxed = with(|object| {
             object.angles = yaw(0);
@@ -374,7 +374,7 @@ fn a_dimension_that_is_a_code_is_no_size() {
 }
 
 #[test]
-fn classes_of_one_label_add_up() {
+fn classes_of_one_label_sum() {
     let classification = classes(&[
         (vehicle(5), 40),
         (vehicle(8), 30),
@@ -410,7 +410,7 @@ fn classes_of_one_label_add_up() {
 }
 
 #[test]
-fn profiles_of_road_users_are_those_of_the_standard() {
+fn road_user_profiles_match_standard() {
     use cdd::VruProfileAndSubprofile::{
         animal, bicyclistAndLightVruVehicle, motorcyclist, pedestrian,
     };
@@ -443,7 +443,7 @@ fn profiles_of_road_users_are_those_of_the_standard() {
 }
 
 #[test]
-fn segments_are_joined_and_a_message_that_lacks_one_is_dropped() {
+fn incomplete_segments_are_dropped() {
     let segment = |x, this, time| {
         decode(
             &message(
@@ -480,7 +480,7 @@ fn segments_are_joined_and_a_message_that_lacks_one_is_dropped() {
 }
 
 #[test]
-fn segments_with_more_objects_than_a_report_may_have_are_dropped() {
+fn oversized_segments_are_dropped() {
     let objects = |number: usize| vec![at(100, 0); number];
     let segment = |this, number| {
         decode(

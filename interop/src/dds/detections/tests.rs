@@ -55,7 +55,7 @@ fn only(camera: &RosCamera, message: &Detection3DArray) -> PerceivedObject {
 }
 
 #[test]
-fn scores_that_are_no_probabilities_are_refused() {
+fn scores_outside_probability_are_refused() {
     let one = message("map", [7.0, 11.0, 0.5], [0.1, 2.0, 0.1], 0.0);
     for (score, hypotheses) in [(f64::NAN, 2), (2.5, 2), (-0.5, 1)] {
         let mut message = one.clone();
@@ -78,7 +78,7 @@ fn scores_that_are_no_probabilities_are_refused() {
 }
 
 #[test]
-fn an_object_is_at_one_place_in_whichever_frame_it_is_stated() {
+fn position_is_frame_independent() {
     // 10 m ahead of a camera that looks north, 2 m to its right; least certain along the view.
     let stated = [
         message("map", [7.0, 11.0, 0.5], [0.1, 2.0, 0.1], FRAC_PI_2),
@@ -116,7 +116,7 @@ fn an_object_is_at_one_place_in_whichever_frame_it_is_stated() {
 }
 
 #[test]
-fn classes_of_one_label_count_together() {
+fn classes_of_one_label_sum() {
     let labels = [
         ("2".to_owned(), "car".to_owned()),
         ("7".to_owned(), "car".to_owned()),
@@ -153,7 +153,7 @@ fn classes_of_one_label_count_together() {
 }
 
 #[test]
-fn a_camera_that_looks_down_places_what_is_before_it_nearer() {
+fn tilted_camera_places_objects_nearer() {
     let mount = Mount {
         height_m: Some(3.0),
         pitch_rad: 0.5,
@@ -172,7 +172,7 @@ fn a_camera_that_looks_down_places_what_is_before_it_nearer() {
 }
 
 #[test]
-fn boxes_are_placed_alike_in_a_whole_picture_and_in_a_binned_part_of_it() {
+fn binned_image_gives_equal_positions() {
     let boxes = |x: f64, y: f64, size_x: f64, size_y: f64, theta: f64| -> Detection2DArray {
         let header = r#"{"stamp": {"sec": 1000, "nanosec": 5000}, "frame_id": "front"}"#;
         let results = serde_json::to_value(
@@ -245,7 +245,7 @@ fn pose_at(frame: &str, seconds: u32, x: f64, yaw_rad: f64) -> PoseStamped {
 }
 
 #[test]
-fn a_camera_that_moves_is_where_it_was_at_the_stamp() {
+fn camera_uses_pose_at_stamp() {
     let mut poses = PoseHistory::default();
     for (seconds, x, yaw_rad) in [
         (999, 4.0, FRAC_PI_2),
@@ -316,7 +316,7 @@ fn a_camera_that_moves_is_where_it_was_at_the_stamp() {
 }
 
 #[test]
-fn a_pose_is_one_in_the_map_with_a_direction() {
+fn pose_needs_map_frame_and_direction() {
     let refusal = |stamped: &PoseStamped| reason(pose_in_map(stamped));
     assert_eq!(
         refusal(&pose_at("odom", 1000, 1.0, 0.0)),
@@ -331,7 +331,7 @@ fn a_pose_is_one_in_the_map_with_a_direction() {
 }
 
 #[test]
-fn what_cannot_be_placed_is_refused_by_reason() {
+fn unplaceable_detections_name_reason() {
     let nowhere = RosCamera {
         pose: None,
         ..camera()

@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_of_one_method_are_one_row() {
+    fn runs_of_one_method_share_row() {
         let runs = [
             run("own", Some(80.0)),
             run("ecod", Some(91.5)),

@@ -57,7 +57,7 @@ fn camera() -> StandingCamera {
 const BOX_AT_12_15: &str = "[540.0, 450.0, 20.0, 50.0]";
 
 #[test]
-fn kittis_labels_and_results_are_in_the_frame_of_the_vehicle() {
+fn kitti_objects_use_vehicle_frame() {
     let text = "0 -1 DontCare -1 -1 -10 219.3 188.5 245.5 218.6 -1000 -1000 -1000 -10 -1 -1 -1\n\
                 0 2 Van 0 0 -1.7 296.7 161.7 455.2 292.3 2.0 1.8 4.4 -4.5 1.8 13.4 -2.1\n\
                 0 3 Car 0 0 -1.7 296.7 161.7 455.2 292.3 1.5 1.6 3.9 -4.5 1.8 13.4 -2.1\n\n\
@@ -74,7 +74,7 @@ fn kittis_labels_and_results_are_in_the_frame_of_the_vehicle() {
 }
 
 #[test]
-fn scores_of_detectors_become_probabilities_in_the_same_order() {
+fn detector_scores_become_ordered_probabilities() {
     let line = |frame: u32, kind: u32, score: f64| {
         format!("{frame},{kind},1,2,3,4,{score},1.5,1.6,3.9,2.9,1.6,6.4,-1.5,-2.0\n")
     };
@@ -94,7 +94,7 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
 }
 
 #[test]
-fn positions_of_mot_challenge_are_those_on_the_ground() {
+fn mot_positions_are_on_ground() {
     let text = "\u{feff}1,-1,912,484,97,109,0.5,3.5,-2.25,0\n2,7,912,484,97,109,1,4,5,0\n2,8,912,484,97,109,0,4,5,0\n";
     let frames = read(FileFormat::Mot, text, None).unwrap().frames;
     assert_eq!(
@@ -107,7 +107,7 @@ fn positions_of_mot_challenge_are_those_on_the_ground() {
 }
 
 #[test]
-fn line_and_field_of_what_cannot_be_read_are_named() {
+fn unreadable_field_is_named_with_line() {
     for (format, text, fault) in [
         (
             FileFormat::Kitti,
@@ -174,7 +174,7 @@ fn line_and_field_of_what_cannot_be_read_are_named() {
 }
 
 #[test]
-fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
+fn image_boxes_are_placed() {
     let camera = camera();
     let dataset = format!(
         "{{\"images\": [{{\"id\": 7}}, {{\"id\": 8}}], \"categories\": [{{\"id\": 1, \"name\": \"van\"}}], \"annotations\": [\
@@ -225,7 +225,7 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
 }
 
 #[test]
-fn what_cannot_be_read_of_coco_is_named_by_its_path() {
+fn unreadable_coco_entry_names_path() {
     let camera = camera();
     for (text, fault) in [
         (
@@ -262,7 +262,7 @@ fn what_cannot_be_read_of_coco_is_named_by_its_path() {
 }
 
 #[test]
-fn an_identity_is_once_in_a_frame() {
+fn repeated_identity_is_refused() {
     let mot =
         "1,7,912,484,97,109,1,4,5,0\n2,7,912,484,97,109,1,4,5,0\n2,7,912,484,97,109,1,6,5,0\n";
     let kitti =
@@ -303,7 +303,7 @@ fn an_identity_is_once_in_a_frame() {
 }
 
 #[test]
-fn one_odd_score_does_not_change_the_others() {
+fn odd_score_leaves_others_unchanged() {
     let line = |frame: u32, score: &str| format!("{frame},-1,1,2,3,4,{score},1.5,2.5,0\n");
     let lines =
         |last: &str| (1..=20).map(|frame| line(frame, "0.9")).collect::<String>() + &line(21, last);
@@ -322,7 +322,7 @@ fn one_odd_score_does_not_change_the_others() {
 }
 
 #[test]
-fn entries_without_area_are_counted_and_the_others_read() {
+fn entries_without_area_are_counted() {
     let camera = camera();
     let coco = format!(
         r#"{{"images": [{{"id": 8}}], "categories": [{{"id": 1, "name": "van"}}], "annotations": [
@@ -354,7 +354,7 @@ fn entries_without_area_are_counted_and_the_others_read() {
 }
 
 #[test]
-fn results_have_the_categories_of_their_dataset() {
+fn results_use_categories_of_dataset() {
     let folder = TempDir::new().unwrap();
     let [truth, results] = ["truth.json", "results.json"].map(|name| folder.path().join(name));
     let dataset = r#"{"images": [], "categories": [{"id": 1, "name": "gate"}], "annotations": []}"#;

@@ -32,7 +32,7 @@ fn near(found: Option<f64>, expected: f64) {
 }
 
 #[test]
-fn what_is_perfect_is_a_hundred_percent() {
+fn perfect_tracking_scores_hundred_percent() {
     let frame = |at: f64| ScoredFrame {
         truth: vec![truth(0, at), truth(1, 10.0 + at)],
         said: vec![said(5, 10.0 + at, 0.9), said(6, at, 0.8)],
@@ -65,7 +65,7 @@ fn what_is_perfect_is_a_hundred_percent() {
 }
 
 #[test]
-fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
+fn empty_output_and_empty_truth_differ() {
     let silent = score(&[ScoredFrame {
         truth: vec![truth(0, 0.0)],
         said: vec![],
@@ -91,7 +91,7 @@ fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
 /// Two objects in one frame; of three reported ones the best and the last are right: precision 1,
 /// 1/2, 2/3 at recall 1/2, 1/2, 1.
 #[test]
-fn average_precision_is_that_worked_out_by_hand() {
+fn average_precision_matches_hand_calculation() {
     let frame = ScoredFrame {
         truth: vec![truth(0, 0.0), truth(1, 20.0)],
         said: vec![said(0, 0.3, 0.9), said(1, 50.0, 0.8), said(2, 21.5, 0.7)],
@@ -147,7 +147,7 @@ fn another_label_is_another_object() {
 
 /// One object over four frames, two with one identity and two with another.
 #[test]
-fn one_switch_costs_what_it_should() {
+fn one_switch_has_expected_cost() {
     let frame = |id| ScoredFrame {
         truth: vec![truth(0, 0.0)],
         said: vec![said(id, 0.0, 0.9)],
@@ -164,7 +164,7 @@ fn one_switch_costs_what_it_should() {
 
 /// One object over six frames, missed in two runs, found by another identity at last.
 #[test]
-fn an_object_that_is_found_again_is_a_fragment() {
+fn rediscovered_object_is_fragment() {
     let frame = |id: Option<u32>| ScoredFrame {
         truth: vec![truth(0, 0.0)],
         said: id.map_or_else(|| vec![said(9, 50.0, 0.9)], |id| vec![said(id, 0.0, 0.9)]),
@@ -185,7 +185,7 @@ fn an_object_that_is_found_again_is_a_fragment() {
 /// Five reported objects: 0.95 right, 0.9 and 1.0 where 1.0 is wrong, 0.55 wrong, 0.05 right. Bins:
 /// 0.9 to 1 states 0.95 and 2 of 3 are right, 0.55 with zero right, 0.05 with one.
 #[test]
-fn calibration_is_that_worked_out_by_hand() {
+fn calibration_matches_hand_calculation() {
     let frame = ScoredFrame {
         truth: vec![truth(0, 0.0), truth(1, 10.0), truth(2, 20.0)],
         said: vec![
@@ -229,7 +229,7 @@ fn calibration_is_that_worked_out_by_hand() {
 
 /// A continued pair keeps its match although another is nearer now.
 #[test]
-fn a_match_is_kept_while_it_is_near_enough() {
+fn match_is_kept_while_near() {
     let frames = [
         ScoredFrame {
             truth: vec![truth(0, 0.0)],
@@ -249,7 +249,7 @@ fn a_match_is_kept_while_it_is_near_enough() {
 }
 
 #[test]
-fn the_matching_has_the_greatest_sum_however_many_contest() {
+fn matching_maximises_sum() {
     let pair = |truth, said, value| MatchedPair { truth, said, value };
     let pairs = [
         pair(0, 0, 0.9),
@@ -282,7 +282,7 @@ fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
 
 /// An object at ten metres a frame, evaluated by maps about the frames, with one lost.
 #[test]
-fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
+fn nearest_map_judges_frame() {
     let frames: Vec<_> = (0..6)
         .map(|n| serde_json::json!({"t_us": n * 100, "objects": [{"id": 1, "label": "car", "x_m": n * 10, "y_m": 0}]}))
         .collect();
@@ -314,7 +314,7 @@ fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
 }
 
 #[test]
-fn classes_that_never_meet_are_listed() {
+fn unmatched_classes_are_listed() {
     let text = r#"{"frames": [{"t_us": 100, "objects": [{"id": 1, "label": "car", "x_m": 1, "y_m": 2}]}]}"#;
     let with = |labels: &[&str]| {
         let mut evaluation = TrackEvaluation::new(TrackTruth::parse(text).unwrap());

@@ -319,7 +319,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_read_and_told_from_locations() {
+    fn frames_and_landmarks_are_distinguished() {
         let text = "\u{feff}{\"note\": 1, \"frames\": [
             {\"t_us\": 100, \"objects\": [{\"id\": 7, \"label\": \"car\", \"x_m\": 1.0, \"y_m\": 2.0, \"vx_mps\": 3.0}]},
             {\"t_us\": 200, \"objects\": [{\"id\": \"b\", \"label\": \"car\", \"x_m\": 0, \"y_m\": 0},
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_named() {
+    fn unreadable_entry_is_named() {
         let object = |rest: &str| {
             format!(
                 r#"{{"frames": [{{"t_us": 1, "objects": [{{"id": 1, "label": "car", {rest}}}]}}]}}"#

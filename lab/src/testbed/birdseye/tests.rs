@@ -44,7 +44,7 @@ fn texts(svg: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_picture_tells_truth_agreement_and_share() {
+fn picture_shows_truth_and_agreement() {
     for (setup, count) in [(SETUP1, 5), (SETUP2, 6)] {
         let testbed = Testbed::from_json(setup).unwrap();
         assert_eq!(testbed.scenes.len(), count);
@@ -83,7 +83,7 @@ fn a_picture_tells_truth_agreement_and_share() {
 }
 
 #[test]
-fn labels_from_the_network_stay_text() {
+fn network_labels_stay_text() {
     let testbed = Testbed::from_json(SETUP1).unwrap();
     let scene = &testbed.scenes[0];
     let nasty = [
@@ -125,7 +125,7 @@ fn bare_scenes_are_drawn() {
 }
 
 #[test]
-fn every_detection_is_drawn_or_counted() {
+fn detections_are_drawn_or_counted() {
     let testbed = Testbed::from_json(SETUP1).unwrap();
     let scene = &testbed.scenes[0];
     let cav = &scene.cavs[0];
@@ -145,7 +145,7 @@ fn every_detection_is_drawn_or_counted() {
 }
 
 #[test]
-fn detections_that_cannot_be_drawn_are_refused() {
+fn undrawable_detections_are_refused() {
     let testbed = Testbed::from_json(SETUP1).unwrap();
     let scene = &testbed.scenes[0];
     let stranger = NodeName::from_static("stranger");

@@ -44,7 +44,7 @@ fn edge(values: &[f64]) -> f64 {
 }
 
 #[test]
-fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
+fn code_corners_match_pinhole_camera() {
     for yaw_deg in [0.0, 30.0, -40.0] {
         let testbed = lot(7.0, yaw_deg + 180.0, "");
         let image = still(&testbed);
@@ -88,7 +88,7 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
 }
 
 #[test]
-fn a_nearer_placard_hides_a_farther_one() {
+fn nearer_placard_hides_farther() {
     let before =
         r#", {"id": 1, "occupied_placard": [8, 0.5], "empty_placard": null, "truth": "NEAR"}"#;
     let one = lot(16.0, 180.0, "");
@@ -119,7 +119,7 @@ fn a_nearer_placard_hides_a_farther_one() {
 }
 
 #[test]
-fn the_back_of_a_placard_shows_no_code() {
+fn placard_back_shows_no_code() {
     let image = still(&lot(16.0, 0.0, ""));
     let values: Vec<_> = (262..312).map(|x| gray(&image, x, 240)).collect();
     assert!(
@@ -129,7 +129,7 @@ fn the_back_of_a_placard_shows_no_code() {
 }
 
 #[test]
-fn frames_repeat_from_the_seed_and_differ_among_themselves() {
+fn frames_repeat_from_seed() {
     let small = SETUP.replace(": 640", ": 160").replace(": 480", ": 120");
     let testbed = Testbed::from_json(&small).unwrap();
     let scene = &testbed.scenes[0];

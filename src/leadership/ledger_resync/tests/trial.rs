@@ -5,7 +5,7 @@ use super::*;
 /// A candidate that starts first receives the claim of `gauss`, and follows it until the leader
 /// renews its term.
 #[test]
-fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_forgotten() {
+fn claimants_counts_are_forgotten() {
     for has_led in [false, true] {
         let mut edge = signing("edge", 7, "edge");
         let mut euclid = signing("other", 8, "gauss");
@@ -48,7 +48,7 @@ fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_
 
 /// The claimant also adds nothing to an earlier leadership of its own that has ended.
 #[test]
-fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
+fn claimant_extends_no_earlier_leadership() {
     let mut euclid = signing("euclid", 5, "gauss");
     euclid.hear(&sign(vec![share(
         "gauss",
@@ -81,7 +81,7 @@ fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
 /// The edge box returns after some seconds: the evidence counted in the meantime is kept, including
 /// on nodes that had dropped it.
 #[test]
-fn a_short_leadership_counts_at_once_where_it_was_handed_on_and_later_at_all() {
+fn short_leadership_counts_after_handover() {
     let mut edge = signing("edge", 8, "gauss");
     let mut hopper = signing("other", 8, "gauss");
     let mut gauss = signing("gauss", 8, "gauss");

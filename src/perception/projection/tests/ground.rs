@@ -198,7 +198,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 #[test]
-fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_height_and_pitch() {
+fn pixel_boxes_within_two_percent() {
     for (height_m, ranging) in HEIGHTS_M
         .into_iter()
         .flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)])
@@ -296,8 +296,7 @@ fn coverage(
 }
 
 #[test]
-fn the_stated_covariance_holds_95_percent_of_the_errors_with_and_without_a_degree_of_unknown_pitch()
-{
+fn covariance_covers_95_percent() {
     for (height_m, ranging) in HEIGHTS_M
         .into_iter()
         .flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)])
@@ -340,7 +339,7 @@ fn range_m(projection: &Projection, detection: &Detection) -> Result<f64, Projec
 }
 
 #[test]
-fn a_person_cut_by_the_lower_or_the_upper_edge_is_still_placed() {
+fn cut_off_person_is_placed() {
     let mount = mount(1.2, 5.0, 0.0);
     let both = projection(Ranging::Auto, mount, &ProjectionConfig::default());
     let whole = person_ahead(6.0, &mount);
@@ -401,7 +400,7 @@ fn a_person_cut_by_the_lower_or_the_upper_edge_is_still_placed() {
 }
 
 #[test]
-fn a_foot_at_or_above_the_horizon_has_no_place_on_the_ground_but_one_by_its_height() {
+fn horizon_foot_is_ranged_by_height() {
     let mount = mount(1.2, 5.0, 0.0);
     let person = person_ahead(9.0, &mount);
     let horizon_px = camera().cy - camera().fy * 5f64.to_radians().tan();
@@ -438,7 +437,7 @@ fn a_foot_at_or_above_the_horizon_has_no_place_on_the_ground_but_one_by_its_heig
 }
 
 #[test]
-fn a_person_on_a_platform_is_placed_by_its_height_and_a_bump_costs_little() {
+fn person_on_platform_uses_height() {
     let mount = mount(1.2, 5.0, 0.0);
     let config = ProjectionConfig {
         tilt_sigma_rad: 0.005,
@@ -461,7 +460,7 @@ fn a_person_on_a_platform_is_placed_by_its_height_and_a_bump_costs_little() {
 }
 
 #[test]
-fn without_a_height_or_with_corners_nothing_changes() {
+fn corners_ignore_ground_ranging() {
     let config = ProjectionConfig::default();
     let level = projection(Ranging::Auto, Mount::default(), &config);
     let by_height = projection(Ranging::BoxHeight, Mount::default(), &config);
@@ -479,7 +478,7 @@ fn without_a_height_or_with_corners_nothing_changes() {
 }
 
 #[test]
-fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() {
+fn tilted_camera_ranges_objects_and_corners() {
     let tilted = Mount {
         height_m: None,
         ..mount(1.2, 8.0, 5.0)
@@ -532,7 +531,7 @@ fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
 }
 
 #[test]
-fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_not() {
+fn turned_camera_is_detected() {
     for (height_m, pitch_deg) in [(1.2, 0.0), (1.2, 10.0), (2.5, 10.0), (6.0, 20.0)] {
         let said = mount(height_m, pitch_deg, 0.0);
         for turned_deg in [-8.0, -5.0, 5.0, 8.0] {
@@ -554,7 +553,7 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
 }
 
 #[test]
-fn a_camera_that_has_turned_is_told_in_a_crowd_too() {
+fn turned_camera_is_detected_in_crowd() {
     let mounted = mount(1.5, -6.0, 0.0);
     let said = mount(1.5, 0.0, 0.0);
     let mut street = Street::new(1.5);
@@ -582,7 +581,7 @@ fn a_camera_that_has_turned_is_told_in_a_crowd_too() {
 }
 
 #[test]
-fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
+fn hanging_objects_indicate_no_turn() {
     let projection = projection(
         Ranging::Auto,
         mount(1.5, 0.0, 0.0),
@@ -607,7 +606,7 @@ fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
 }
 
 #[test]
-fn things_above_the_ground_at_one_distance_are_no_sign_of_a_camera_that_has_turned() {
+fn raised_objects_indicate_no_turn() {
     let projection = projection(
         Ranging::Auto,
         mount(1.2, 0.0, 0.0),

@@ -135,7 +135,7 @@ fn is_near(found: &Mount, real: &Mount) {
 }
 
 #[test]
-fn a_qr_code_on_the_ground_gives_height_and_tilt() {
+fn qr_code_gives_height_and_tilt() {
     let (drawing, modules) = code("ecod");
     for (real, ahead_m, yaw_rad) in [
         (mount(1.3, 25.0, 0.0), 2.2, 0.3),
@@ -161,7 +161,7 @@ fn a_qr_code_on_the_ground_gives_height_and_tilt() {
 }
 
 #[test]
-fn a_chessboard_on_the_ground_gives_height_and_tilt() {
+fn chessboard_gives_height_and_tilt() {
     let drawing = flat(8, |row, column| row < 7 && (row + column) % 2 == 0);
     let board = GroundBoard::Chessboard(Chessboard {
         columns: 7,
@@ -181,7 +181,7 @@ fn a_chessboard_on_the_ground_gives_height_and_tilt() {
 }
 
 #[test]
-fn a_photograph_without_the_board_or_with_two_is_told_so() {
+fn missing_or_second_board_reported() {
     let qr_code = GroundBoard::QrCode { side_mm: SIDE_MM };
     let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
     let none = fit_board(&blank, &qr_code, &lens())

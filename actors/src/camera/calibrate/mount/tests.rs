@@ -71,7 +71,7 @@ fn is_near(fit: &GroundFit, pose: &Pose, real: &Mount, tilt_deg: f64, metres: f6
 }
 
 #[test]
-fn a_camera_is_found_from_four_points_whatever_its_height_and_tilt() {
+fn four_points_recover_any_mount() {
     for (height_m, pitch_deg, roll_deg, heading) in [
         (1.2, 5.0, 0.0, 0.0),
         (2.5, 12.0, -4.0, 0.1),
@@ -86,7 +86,7 @@ fn a_camera_is_found_from_four_points_whatever_its_height_and_tilt() {
 }
 
 #[test]
-fn a_wrong_point_is_named_and_costs_nothing() {
+fn wrong_point_is_named() {
     let pose = Pose::new(0.4, -0.2, 0.1);
     let real = mount(2.5, 12.0, -4.0);
     let mut off_px = [
@@ -132,7 +132,7 @@ fn a_wrong_point_is_named_and_costs_nothing() {
 }
 
 #[test]
-fn what_gives_no_camera_is_told_with_the_remedy() {
+fn unsolvable_input_names_remedy() {
     let pose = Pose::new(0.0, 0.0, 0.0);
     let real = mount(2.5, 12.0, 0.0);
     let points = seen(&PLACES, &EXACT, &pose, &real);

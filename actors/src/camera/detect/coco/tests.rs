@@ -71,7 +71,7 @@ fn distant_cat() -> Mat {
 }
 
 #[test]
-fn tiles_raise_the_confidence_in_a_small_object_and_keep_its_place() {
+fn tiles_find_small_objects() {
     let config = CocoConfig {
         threshold: 0.05,
         ..CocoConfig::default()
@@ -107,7 +107,7 @@ fn tiles_raise_the_confidence_in_a_small_object_and_keep_its_place() {
 }
 
 #[test]
-fn one_object_is_found_once_with_tiles() {
+fn tiles_report_object_once() {
     let mut detector = CocoDetector::new(CocoConfig {
         tiling: true,
         ..CocoConfig::default()
@@ -157,7 +157,7 @@ fn an_unusable_model_is_named() {
 }
 
 #[test]
-fn an_unusable_image_is_an_error_and_the_detector_stays_usable() {
+fn detector_survives_unusable_image() {
     let mut detector = CocoDetector::new(CocoConfig::default()).unwrap();
     let error = detector
         .detect(&frame(Mat::default()))
@@ -199,7 +199,7 @@ fn the_numbering_is_coco_s() {
 }
 
 #[test]
-fn every_label_has_a_usual_size() {
+fn every_label_has_usual_size() {
     let sizes = ecod::perception::projection::ObjectSizes::default();
     let without: Vec<_> = labels::all()
         .filter(|(_, label)| sizes.of(label).is_none())

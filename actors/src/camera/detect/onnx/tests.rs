@@ -75,7 +75,7 @@ fn expected() -> BTreeMap<String, Vec<Expected>> {
 }
 
 #[test]
-fn every_family_is_recognised_and_finds_what_an_independent_decoder_finds() {
+fn every_family_matches_independent_decoder() {
     let expected = expected();
     assert_eq!(expected.len(), 13);
     for (model, expected) in expected {
@@ -93,7 +93,7 @@ fn every_family_is_recognised_and_finds_what_an_independent_decoder_finds() {
 }
 
 #[test]
-fn a_family_may_be_told_and_must_then_fit() {
+fn stated_family_must_fit_model() {
     for (model, family) in [
         ("yolov5", Family::Yolov5),
         ("yolov8_nms", Family::Yolov8),
@@ -116,7 +116,7 @@ fn a_family_may_be_told_and_must_then_fit() {
 }
 
 #[test]
-fn a_background_among_scored_classes_is_no_object() {
+fn background_class_is_no_object() {
     let directory = tempfile::tempdir().unwrap();
     for model in ["yolov5", "yolov8", "yolov8_nms"] {
         let all = OnnxDetector::new(labelled(model))
@@ -145,7 +145,7 @@ fn a_background_among_scored_classes_is_no_object() {
 }
 
 #[test]
-fn a_label_has_its_own_threshold() {
+fn threshold_applies_to_one_label() {
     let all = OnnxDetector::new(labelled("yolov5"))
         .unwrap()
         .detect(&frame())
@@ -168,7 +168,7 @@ fn a_label_has_its_own_threshold() {
 }
 
 #[test]
-fn outputs_of_no_family_are_printed() {
+fn unknown_outputs_are_printed() {
     let error = refusal(config("yolov8_segments"));
     for part in [
         "output0 [1, 39, 84]; output1 [1, 32, 4, 4]",
@@ -193,7 +193,7 @@ fn yolox_in_pixels_is_refused() {
 }
 
 #[test]
-fn files_that_cannot_be_used_are_named() {
+fn unusable_files_are_named() {
     let missing = refusal(config("no_such"));
     assert!(
         missing.contains("cannot read") && missing.contains("no_such.onnx"),
@@ -217,7 +217,7 @@ fn files_that_cannot_be_used_are_named() {
 }
 
 #[test]
-fn the_size_of_the_input_is_the_model_s() {
+fn input_size_comes_from_model() {
     let told = refusal(OnnxConfig {
         input_px: Some([96, 64]),
         ..config("yolov8")
@@ -238,7 +238,7 @@ fn the_size_of_the_input_is_the_model_s() {
 }
 
 #[test]
-fn labels_must_be_as_many_as_classes() {
+fn label_count_must_match_classes() {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), "one\ntwo\n").unwrap();
     let labels = Some(file.path().to_owned());
@@ -279,7 +279,7 @@ fn labels_must_be_as_many_as_classes() {
 }
 
 #[test]
-fn a_class_without_a_label_is_an_error_of_the_frame() {
+fn class_without_label_fails_frame() {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), "one\n").unwrap();
     let config = OnnxConfig {
@@ -298,7 +298,7 @@ fn a_class_without_a_label_is_an_error_of_the_frame() {
 }
 
 #[test]
-fn names_are_read_from_files_and_metadata() {
+fn names_come_from_file_or_metadata() {
     for (text, names, first) in [
         (
             r#"{0: 'person', 1: "it's", 2: 'a \'b\''}"#,
@@ -353,7 +353,7 @@ fn names_are_read_from_files_and_metadata() {
 }
 
 #[test]
-fn coco_s_classes_have_labels_however_a_family_numbers_them() {
+fn coco_labels_fit_every_family() {
     let label = |scores, first, has_none_last, class: usize| {
         let classes = labels::Classes {
             scores,
@@ -377,7 +377,7 @@ fn coco_s_classes_have_labels_however_a_family_numbers_them() {
 }
 
 #[test]
-fn a_letterbox_keeps_shapes_and_brings_boxes_back() {
+fn letterbox_keeps_box_positions() {
     let input = ImageSize {
         width: 640,
         height: 480,
@@ -416,7 +416,7 @@ fn a_letterbox_keeps_shapes_and_brings_boxes_back() {
 }
 
 #[test]
-fn frames_of_any_shape_give_boxes_inside_them() {
+fn boxes_stay_inside_any_frame() {
     for model in ["yolov5", "yolox", "ssd", "rtdetr"] {
         let mut detector = OnnxDetector::new(OnnxConfig {
             threshold: 0.01,
@@ -458,7 +458,7 @@ struct Photographed {
 
 #[test]
 #[ignore = "needs weights of YOLOX: make models-check YOLOX=FILE"]
-fn yolox_finds_in_photographs_what_onnx_runtime_finds_with_the_same_weights() {
+fn yolox_matches_onnx_runtime() {
     let file = |key| PathBuf::from(std::env::var_os(key).expect(key));
     let expected = std::fs::read_to_string(file("YOLOX_PHOTOS")).unwrap();
     let expected: BTreeMap<String, Vec<Photographed>> = serde_json::from_str(&expected).unwrap();
@@ -538,7 +538,7 @@ fn config_of(file: &tempfile::NamedTempFile) -> OnnxConfig {
 const NAMES: &str = r#"{0: 'person', 1: 'traffic light', 2: 'it\'s a "car"'}"#;
 
 #[test]
-fn names_of_metadata_belong_to_their_numbers() {
+fn metadata_names_keep_their_numbers() {
     let swapped = r#"{1: 'traffic light', 0: 'person', 2: 'it\'s a "car"'}"#;
     let file = edited("yolov8", &[(NAMES, swapped)]);
     let found = OnnxDetector::new(config_of(&file))
@@ -573,7 +573,7 @@ fn names_of_metadata_belong_to_their_numbers() {
 }
 
 #[test]
-fn a_model_of_another_task_is_named() {
+fn foreign_task_model_is_refused() {
     let error = refusal(config_of(&edited("yolov8", &[("detect", "posing")])));
     assert!(
         error.contains("the task \"posing\"") && error.contains("export a model for detection"),
@@ -584,7 +584,7 @@ fn a_model_of_another_task_is_named() {
 }
 
 #[test]
-fn lists_of_an_unknown_exporter_need_the_number_of_the_first_class() {
+fn unknown_exporter_needs_first_class() {
     let labels = Some(path("labels.txt"));
     let file = edited("ssd_torchvision", &[("boxes", "b_box")]);
     let unknown = OnnxConfig {
@@ -619,7 +619,7 @@ fn lists_of_an_unknown_exporter_need_the_number_of_the_first_class() {
 }
 
 #[test]
-fn boxes_and_scores_that_contradict_the_family_are_no_detections() {
+fn contradictory_scores_are_dropped() {
     let input = ImageSize {
         width: 640,
         height: 480,
@@ -668,7 +668,7 @@ fn boxes_and_scores_that_contradict_the_family_are_no_detections() {
 }
 
 #[test]
-fn a_third_side_of_the_input_is_refused() {
+fn third_input_side_is_refused() {
     let read =
         |sides: &str| toml::from_str::<OnnxConfig>(&format!("model = 'm'\ninput_px = {sides}"));
     assert_eq!(read("[640, 480]").unwrap().input_px, Some([640, 480]));

@@ -139,7 +139,7 @@ fn detect(frame: &CameraFrame) -> Vec<Detection> {
 }
 
 #[test]
-fn a_placard_is_read_near_and_far_and_at_a_slant() {
+fn placard_is_read_near_and_slanted() {
     for (range_in, yaw_deg) in [
         (8.0, 0.0),
         (8.0, 63.0),
@@ -187,7 +187,7 @@ fn nearer_placards_are_trusted_more() {
 }
 
 #[test]
-fn the_same_text_at_two_places_is_two_placards() {
+fn repeated_text_is_two_placards() {
     let mut scene = Scene::empty();
     let left = scene.put(&code("EMPTY"), 13.5, -12.0, 0.0);
     let right = scene.put(&code("EMPTY"), 13.5, 12.0, 60.0);
@@ -206,7 +206,7 @@ fn the_same_text_at_two_places_is_two_placards() {
 }
 
 #[test]
-fn no_more_codes_are_read_than_asked_for() {
+fn code_count_is_limited() {
     let mut scene = Scene::empty();
     scene.put(&code("A"), 12.0, -12.0, 0.0);
     scene.put(&code("B"), 12.0, 12.0, 0.0);
@@ -223,7 +223,7 @@ fn there_is_nothing_in_noise() {
 }
 
 #[test]
-fn color_frames_are_read_as_well() {
+fn color_frames_are_read() {
     let mut scene = Scene::empty();
     scene.put(&code("SLOT-3"), 10.0, 0.0, 0.0);
     let mut color = Mat::default();
@@ -232,7 +232,7 @@ fn color_frames_are_read_as_well() {
 }
 
 #[test]
-fn texts_that_are_no_label_are_left_out_without_disturbing_others() {
+fn invalid_texts_are_skipped() {
     for odd in [
         &b"\xff\xfe\x80abc"[..],
         b"two\nlines",
@@ -252,7 +252,7 @@ fn texts_that_are_no_label_are_left_out_without_disturbing_others() {
 }
 
 #[test]
-fn images_without_8_bit_pixels_are_refused() {
+fn images_need_8_bit_pixels() {
     let deep = Mat::new_rows_cols_with_default(48, 64, CV_16UC1, Scalar::all(0.0)).unwrap();
     for image in [Mat::default(), deep] {
         let error = PlacardDetector::new(PlacardConfig::default())
@@ -266,7 +266,7 @@ fn images_without_8_bit_pixels_are_refused() {
 }
 
 #[test]
-fn configurations_that_cannot_work_are_refused() {
+fn unusable_configurations_are_refused() {
     PlacardConfig::default().validate().unwrap();
     let pass = |stretch_x| Pass {
         stretch_x,

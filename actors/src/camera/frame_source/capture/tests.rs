@@ -79,7 +79,7 @@ async fn wait_for(capture: &Capture, wanted: impl Fn(&CaptureStatus) -> bool) {
 }
 
 #[tokio::test]
-async fn a_source_that_fails_twice_works_the_third_time() {
+async fn source_recovers_after_two_failures() {
     let capture = Capture::start(
         scripted(vec![
             None,
@@ -95,7 +95,7 @@ async fn a_source_that_fails_twice_works_the_third_time() {
 }
 
 #[tokio::test]
-async fn an_unusable_frame_is_counted_and_costs_no_new_opening() {
+async fn unusable_frame_causes_no_reopening() {
     let openings = vec![Some(vec![Step::Spoil, Step::CameraFrame, Step::Spoil])];
     let capture = Capture::start(scripted(openings), hasty()).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
@@ -107,7 +107,7 @@ async fn an_unusable_frame_is_counted_and_costs_no_new_opening() {
 }
 
 #[tokio::test]
-async fn a_failure_is_reported_with_its_reason() {
+async fn failure_is_reported_with_reason() {
     let config = CaptureConfig {
         retry_min_s: 60.0,
         retry_max_s: 60.0,
@@ -129,7 +129,7 @@ async fn a_failure_is_reported_with_its_reason() {
 }
 
 #[tokio::test]
-async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
+async fn blocked_source_is_reopened() {
     let (release, blocked) = mpsc::channel();
     let config = CaptureConfig {
         stall_timeout_s: 1.0,
@@ -161,7 +161,7 @@ async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
 }
 
 #[tokio::test]
-async fn frames_that_nobody_took_in_time_are_skipped_and_counted() {
+async fn untaken_frames_are_counted() {
     let openings = vec![Some(vec![
         Step::CameraFrame,
         Step::CameraFrame,
@@ -180,7 +180,7 @@ async fn frames_that_nobody_took_in_time_are_skipped_and_counted() {
 }
 
 #[tokio::test]
-async fn a_dropped_capture_lets_go_of_its_source() {
+async fn dropped_capture_releases_source() {
     let held = Arc::new(());
     let opener: Opener = {
         let held = Arc::clone(&held);
@@ -214,7 +214,7 @@ async fn a_dropped_capture_lets_go_of_its_source() {
 }
 
 #[test]
-fn the_wait_doubles_up_to_its_bound() {
+fn retry_wait_doubles_to_bound() {
     let config = CaptureConfig {
         retry_min_s: 0.5,
         retry_max_s: 3.0,

@@ -445,7 +445,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_elements_of_a_pipeline_are_told_from_caps_and_properties() {
+    fn pipeline_elements_are_recognised() {
         let pipeline = "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
         assert_eq!(
             elements(pipeline).collect::<Vec<_>>(),

@@ -513,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn drawings_are_as_large_as_the_scene_allows() {
+    fn drawings_fill_allowed_scene_size() {
         let diameters =
             [0.05, 0.2, 2.5, 300.0].map(|spacing_m| SceneStyle::of(&places(spacing_m)).object_m);
         for (is, expected) in diameters.iter().zip([0.02, 0.08, 1.0, 1.0]) {
@@ -523,7 +523,7 @@ mod tests {
     }
 
     #[test]
-    fn an_ellipse_has_its_long_axis_where_the_position_is_least_certain() {
+    fn ellipse_follows_largest_uncertainty() {
         let covariance = Covariance::along_bearing(0.5, 2.0, 0.5);
         let entity = SceneEntity::new(Timestamp(1), String::new()).ellipse(
             [3.0, 4.0],
@@ -548,7 +548,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_of_view_is_a_sector_about_the_heading_and_all_around_a_circle() {
+    fn field_of_view_is_sector() {
         let pose = WirePose::new(1.0, 2.0, 0.3);
         let line = |angle_rad| {
             let entity = SceneEntity::new(Timestamp(1), String::new());
@@ -583,7 +583,7 @@ mod tests {
     }
 
     #[test]
-    fn objects_have_their_size_and_places_their_facing() {
+    fn objects_have_size_and_heading() {
         let mut landmarks = places(1.0);
         landmarks[1].facing_deg = Some(90.0);
         let style = SceneStyle::of(&landmarks);

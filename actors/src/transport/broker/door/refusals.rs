@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn who_misbehaves_now_is_shown_however_many_did_before() {
+    fn current_offender_is_always_shown() {
         let mut refusals = Refusals::default();
         for n in 0..MAX_SHOWN {
             assert!(
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_program_sent_is_not_quoted_at_length() {
+    fn long_client_text_is_shortened() {
         let refusal = DoorRefusal::not_permitted("é".repeat(100_000));
         assert_eq!(refusal.text.len(), MAX_TEXT);
         assert_eq!(

@@ -228,7 +228,7 @@ fn index(address: SocketAddr) -> usize {
 }
 
 #[test]
-fn nodes_find_each_other_by_multicast() {
+fn nodes_meet_by_multicast() {
     let cell = Cell::of(8);
     cell.assert_complete();
     let member = &cell.nodes[&1].machine.members()[0];
@@ -239,7 +239,7 @@ fn nodes_find_each_other_by_multicast() {
 }
 
 #[test]
-fn nodes_find_each_other_by_one_seed_whoever_starts_first() {
+fn nodes_meet_by_one_seed() {
     let mut cell = Cell::new(false);
     for node in 2..=5 {
         cell.start(node, &name(node));
@@ -257,7 +257,7 @@ fn nodes_find_each_other_by_one_seed_whoever_starts_first() {
 }
 
 #[test]
-fn a_seed_that_returns_hears_of_its_cell_before_it_leads_on_its_own() {
+fn returning_seed_finds_its_cell() {
     for seed in 0..20 {
         let mut cell = Cell::seeded(false, seed);
         (1..=4).for_each(|node| cell.start(node, &name(node)));
@@ -279,7 +279,7 @@ fn a_seed_that_returns_hears_of_its_cell_before_it_leads_on_its_own() {
 }
 
 #[test]
-fn cells_form_over_a_network_that_loses_a_fifth() {
+fn cell_forms_despite_loss() {
     let mut cell = Cell::new(true);
     cell.loss_percent = 20;
     (1..=6).for_each(|node| cell.start(node, &name(node)));
@@ -290,7 +290,7 @@ fn cells_form_over_a_network_that_loses_a_fifth() {
 }
 
 #[test]
-fn a_dead_node_is_given_up_by_all_and_nobody_else_is() {
+fn only_dead_node_goes_down() {
     let mut cell = Cell::of(8);
     cell.forget_events();
     cell.nodes.remove(&3);
@@ -313,7 +313,7 @@ fn a_dead_node_is_given_up_by_all_and_nobody_else_is() {
 }
 
 #[test]
-fn a_node_that_leaves_is_gone_at_once() {
+fn leaving_node_goes_at_once() {
     let mut cell = Cell::of(4);
     let now = cell.now;
     cell.nodes.get_mut(&2).unwrap().machine.leave(now);
@@ -329,7 +329,7 @@ fn a_node_that_leaves_is_gone_at_once() {
 }
 
 #[test]
-fn a_stopped_node_comes_back_and_blames_nobody() {
+fn stopped_node_rejoins() {
     let mut cell = Cell::of(6);
     cell.nodes.get_mut(&4).unwrap().stopped = true;
     cell.run(5000);
@@ -347,7 +347,7 @@ fn a_stopped_node_comes_back_and_blames_nobody() {
 }
 
 #[test]
-fn a_restarted_node_replaces_its_older_run_even_with_its_clock_set_back() {
+fn restart_survives_backward_clock() {
     let mut cell = Cell::of(4);
     for run in [cell.now.micros(), 1000] {
         cell.nodes.remove(&2);
@@ -366,7 +366,7 @@ fn a_restarted_node_replaces_its_older_run_even_with_its_clock_set_back() {
 }
 
 #[test]
-fn a_quick_restart_is_news_and_no_death() {
+fn quick_restart_is_no_death() {
     let mut cell = Cell::new(false);
     for node in 1..=8 {
         cell.start(node, &name(node));
@@ -396,7 +396,7 @@ fn a_quick_restart_is_news_and_no_death() {
 }
 
 #[test]
-fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up() {
+fn second_namesake_gives_up() {
     let mut cell = Cell::of(4);
     cell.forget_events();
     cell.start(9, "node-2");
@@ -438,7 +438,7 @@ fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up
 }
 
 #[test]
-fn two_taken_names_are_reported_beside_each_other() {
+fn two_taken_names_are_reported() {
     let mut cell = Cell::of(4);
     cell.start(9, "node-2");
     cell.start(10, "node-3");
@@ -477,7 +477,7 @@ fn assert_second_gave_up(cell: &Cell) {
 }
 
 #[test]
-fn a_second_node_whose_only_seed_is_the_first_gives_up() {
+fn second_namesake_of_seed_gives_up() {
     for others in [0, 2] {
         let mut cell = Cell::new(false);
         (1..=1 + others).for_each(|node| cell.start(node, &name(node)));
@@ -499,7 +499,7 @@ fn a_second_node_whose_only_seed_is_the_first_gives_up() {
 
 /// Two nodes that discover each other late compare their start times.
 #[test]
-fn of_two_lone_nodes_of_a_name_that_meet_late_the_later_one_gives_up() {
+fn late_meeting_namesake_gives_up() {
     let mut cell = Cell::new(false);
     cell.start(1, &name(1));
     cell.run(1000);
@@ -517,7 +517,7 @@ fn of_two_lone_nodes_of_a_name_that_meet_late_the_later_one_gives_up() {
 }
 
 #[test]
-fn a_node_that_returns_at_another_address_has_its_name_as_soon_as_its_former_run_is_down() {
+fn moved_node_regains_its_name() {
     let mut cell = Cell::of(4);
     cell.nodes.remove(&2);
     cell.start(9, "node-2");
@@ -554,7 +554,7 @@ fn datagrams_arrive_with_their_sender() {
 }
 
 #[test]
-fn two_nodes_hear_each_other_as_often_as_the_network_lets_them_though_the_gossip_gives_both_up() {
+fn lossy_link_keeps_nodes_connected() {
     let mut cell = Cell::of(2);
     cell.loss_percent = 20;
     cell.forget_events();
@@ -584,7 +584,7 @@ fn two_nodes_hear_each_other_as_often_as_the_network_lets_them_though_the_gossip
 }
 
 #[test]
-fn nothing_is_sent_to_one_that_went_out_of_range_long_ago() {
+fn long_lost_peer_gets_no_frames() {
     let mut cell = Cell::of(2);
     cell.nodes.remove(&2);
     for (wait_ms, left_out) in [(2000, 0), (10_000, 1)] {
@@ -601,7 +601,7 @@ fn nothing_is_sent_to_one_that_went_out_of_range_long_ago() {
 }
 
 #[test]
-fn two_sides_of_a_split_meet_again() {
+fn split_cell_merges_again() {
     let mut cell = Cell::of(6);
     cell.island = [1, 2, 3].into();
     cell.run(4000);
@@ -612,7 +612,7 @@ fn two_sides_of_a_split_meet_again() {
 }
 
 #[test]
-fn nodes_with_another_key_are_not_seen() {
+fn other_key_stays_unseen() {
     let mut cell = Cell::new(true);
     cell.start(1, "node-1");
     cell.start(2, "node-2");
@@ -626,7 +626,7 @@ fn nodes_with_another_key_are_not_seen() {
 
 /// Only the other side can detect a wrong key; this side at least sees a silent seed.
 #[test]
-fn a_node_that_no_seed_answers_says_which_and_does_not_take_itself_for_one() {
+fn silent_seeds_are_named() {
     let mut cell = Cell::new(false);
     cell.start(1, "node-1");
     cell.start_at(2, "node-2", "another passphrase", 5);

@@ -137,7 +137,7 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
 }
 
 #[test]
-fn introduced_nodes_understand_each_other_once() {
+fn handshake_opens_session_once() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
@@ -177,7 +177,7 @@ fn forge(key: &CellKey, sender: &SessionId, receiver: &SessionId, counter: u64) 
 }
 
 #[test]
-fn a_counter_from_beyond_mutes_nobody() {
+fn huge_counter_blocks_no_frames() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
@@ -196,7 +196,7 @@ fn a_counter_from_beyond_mutes_nobody() {
 }
 
 #[test]
-fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
+fn live_session_resists_takeover() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
@@ -221,7 +221,7 @@ fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
 }
 
 #[test]
-fn a_member_that_floods_is_not_heard_for_long() {
+fn flooding_member_is_muted() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
@@ -266,7 +266,7 @@ fn recorded_handshakes_admit_nobody() {
 }
 
 #[test]
-fn a_proof_from_elsewhere_or_too_late_is_none() {
+fn late_or_foreign_proof_is_refused() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     let hello = a.hello();
@@ -282,7 +282,7 @@ fn a_proof_from_elsewhere_or_too_late_is_none() {
 }
 
 #[test]
-fn frames_of_strangers_cause_a_greeting_and_count() {
+fn stranger_frames_trigger_counted_greeting() {
     let mut a = End::new("a", 1);
     let mut b = End::new("b", 2);
     introduce(&mut a, &mut b);
@@ -293,7 +293,7 @@ fn frames_of_strangers_cause_a_greeting_and_count() {
 }
 
 #[test]
-fn the_table_is_bounded_and_only_the_silent_give_way() {
+fn only_silent_peers_are_evicted() {
     let mut b = End::new("b", 100);
     for (session, name) in (1..=4).zip(["v", "w", "x", "y"]) {
         introduce(&mut End::new(name, session), &mut b);
@@ -349,7 +349,7 @@ proptest! {
 /// Misconfigured nodes are reported: a node with another key by its address, and a cell whose name
 /// is a typing error away.
 #[test]
-fn another_key_and_a_misspelt_cell_are_named() {
+fn other_key_and_typo_reported() {
     let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
         let mut node = End::of_cell((own, "07"), "euclid", 1, None);
         node.known = (!is_alone).then_some(KnownMember {

@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_renewed_certificate_has_the_same_name_rights_and_duration_and_another_key() {
+    fn renewal_keeps_name_and_rights() {
         let directory = tempfile::tempdir().unwrap();
         let now = clock::wall();
         let mut authority = authority(directory.path());
@@ -174,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_valid_certificate_of_this_ca_that_ends_soon_is_renewed_and_not_often() {
+    fn only_expiring_certificate_is_renewed() {
         let [directory, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let mut authority = authority(directory.path());
         let now = clock::wall();

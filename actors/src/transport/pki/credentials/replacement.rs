@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_of_power_at_any_moment_leaves_a_certificate_with_its_key() {
+    fn power_loss_keeps_matching_key() {
         let Machine {
             mut authority,
             files,
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_certificate_with_another_name_other_rights_or_another_key_is_not_installed() {
+    fn mismatching_certificate_is_not_installed() {
         let Machine {
             mut authority,
             files,

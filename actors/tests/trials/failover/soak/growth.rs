@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_leak_is_seen_and_a_step_or_a_peak_is_not() {
+    fn only_steady_growth_is_leak() {
         let leak = series(30, |minute| resident(20_000 + 600 * minute));
         assert_eq!(leak.growth().unwrap(), "resident KiB 29000 to 35000");
         assert_eq!(
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn descriptors_and_threads_count_as_well() {
+    fn descriptors_and_threads_count() {
         let leak = series(12, |minute| Resources {
             descriptors: 10 * minute as u64,
             ..resident(20_000)
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn this_process_has_all_of_them() {
+    fn process_resources_are_read() {
         let own = Resources::of(std::process::id()).unwrap();
         assert!(own.resident_kib > 0 && own.descriptors > 0 && own.threads > 0);
     }

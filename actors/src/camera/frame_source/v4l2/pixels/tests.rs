@@ -17,7 +17,7 @@ fn pixel(image: &Mat, row: i32, column: i32) -> [u8; 3] {
 }
 
 #[test]
-fn the_format_that_costs_least_is_chosen() {
+fn cheapest_format_is_chosen() {
     let formats = |names: &[&[u8; 4]]| {
         names
             .iter()
@@ -42,7 +42,7 @@ fn the_format_that_costs_least_is_chosen() {
 
 /// Red has brightness 81 and colours 90 and 240 by BT.601, gray 126 and 128 twice.
 #[test]
-fn packed_and_planar_colors_become_bgr() {
+fn packed_and_planar_become_bgr() {
     let y = 81;
     let u = 90;
     let v = 240;
@@ -80,7 +80,7 @@ fn packed_and_planar_colors_become_bgr() {
 }
 
 #[test]
-fn bytes_between_rows_are_no_pixels() {
+fn row_padding_is_ignored() {
     // Two pixels of gray, then padding that would be green.
     let row = [126, 128, 126, 128, 0, 0, 0, 0];
     let image = convert(b"YUYV", [2, 2], 8, &row.repeat(2)).unwrap();
@@ -103,7 +103,7 @@ fn bytes_between_rows_are_no_pixels() {
 }
 
 #[test]
-fn a_part_of_a_frame_is_refused() {
+fn partial_frame_is_refused() {
     assert!(
         convert(b"YUYV", [4, 2], 0, &[0; 15])
             .unwrap_err()
@@ -132,7 +132,7 @@ fn without_huffman_tables(jpeg: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn motion_jpeg_is_read_also_without_its_tables_and_with_bytes_behind_it() {
+fn incomplete_motion_jpeg_is_read() {
     let image =
         Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::new(200.0, 100.0, 50.0, 0.0))
             .unwrap();

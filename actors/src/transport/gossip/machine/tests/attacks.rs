@@ -80,7 +80,7 @@ fn recorded_frames_conjure_up_nobody() {
 }
 
 #[test]
-fn a_flood_of_recorded_greetings_is_answered_at_a_bounded_rate() {
+fn recorded_greetings_are_rate_limited() {
     let mut old = Cell::of(2);
     let (_, _, hello) = old.recorded.remove(0);
     let mut cell = Cell::seeded(true, 4);
@@ -111,7 +111,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn junk_is_counted_and_changes_nothing(
+    fn junk_is_counted_only(
         junk in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..1400), 1..40),
         bent in prop::collection::vec((any::<prop::sample::Index>(), any::<prop::sample::Index>(), 1u8..), 1..40),
     ) {

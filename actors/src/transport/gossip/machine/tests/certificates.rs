@@ -50,7 +50,7 @@ impl CertifiedCell {
 }
 
 #[test]
-fn nodes_with_certificates_find_each_other() {
+fn nodes_with_certificates_meet() {
     let mut certified = CertifiedCell::of(6);
     certified.cell.assert_complete();
     certified.cell.nodes.remove(&3);
@@ -62,7 +62,7 @@ fn nodes_with_certificates_find_each_other() {
 }
 
 #[test]
-fn a_second_node_with_a_certificate_whose_only_seed_is_the_first_gives_up() {
+fn certified_namesake_of_seed_gives_up() {
     let mut certified = CertifiedCell::new(false);
     certified.start(1);
     certified.cell.run(8000);
@@ -77,7 +77,7 @@ fn a_second_node_with_a_certificate_whose_only_seed_is_the_first_gives_up() {
 }
 
 #[test]
-fn nodes_with_certificates_find_each_other_by_one_seed() {
+fn certified_nodes_meet_by_seed() {
     let mut certified = CertifiedCell::new(false);
     for node in 1..=5 {
         certified.start(node);
@@ -88,7 +88,7 @@ fn nodes_with_certificates_find_each_other_by_one_seed() {
 }
 
 #[test]
-fn a_cell_with_certificates_forms_over_a_network_that_loses_a_fifth() {
+fn certified_cell_forms_despite_loss() {
     let mut certified = CertifiedCell::new(true);
     certified.cell.loss_percent = 20;
     (1..=4).for_each(|node| certified.start(node));
@@ -99,7 +99,7 @@ fn a_cell_with_certificates_forms_over_a_network_that_loses_a_fifth() {
 }
 
 #[test]
-fn a_key_without_a_certificate_of_the_cell_admits_nobody() {
+fn key_alone_admits_no_node() {
     let mut certified = CertifiedCell::of(3);
     let now = certified.cell.now.micros();
     certified.cell.forget_events();
@@ -128,7 +128,7 @@ fn a_key_without_a_certificate_of_the_cell_admits_nobody() {
 }
 
 #[test]
-fn a_revoked_node_is_down_when_the_list_is_read_and_stays_out_until_it_has_a_new_certificate() {
+fn revoked_node_needs_new_certificate() {
     let mut certified = CertifiedCell::of(4);
     certified.cell.forget_events();
     certified.authority.revoke(&node_name(4));
@@ -154,7 +154,7 @@ fn a_revoked_node_is_down_when_the_list_is_read_and_stays_out_until_it_has_a_new
 }
 
 #[test]
-fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
+fn renewed_certificate_reaches_all() {
     let mut certified = CertifiedCell::of(3);
     certified.cell.forget_events();
     let renewed = certified.authority.identity("node-1", Role::Auto);
@@ -165,7 +165,7 @@ fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
 
 /// A machine that starts in 1970 rejects all certificates, and joins once its clock is set.
 #[test]
-fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
+fn node_with_wrong_clock_waits() {
     let mut certified = CertifiedCell::of(2);
     let right = certified.authority.identity("node-3", Role::Auto);
     let wrong = Identity {
@@ -184,7 +184,7 @@ fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
 }
 
 #[test]
-fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
+fn lost_sessions_recover_within_second() {
     let mut certified = CertifiedCell::of(2);
     certified.machine(1).sessions.forget_all();
     for _ in 0..20 {
@@ -212,7 +212,7 @@ fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
 
 /// A member makes false statements about another: a later life, another address, another role.
 #[test]
-fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
+fn false_statement_overrides_no_node() {
     let mut certified = CertifiedCell::of(3);
     certified.cell.forget_events();
     let before = certified.machine(1).members();
@@ -247,7 +247,7 @@ fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
 
 /// A member reports repeatedly that another node is down, while that node keeps sending.
 #[test]
-fn a_node_that_is_heard_is_not_down_on_the_word_of_others() {
+fn sending_node_stays_alive() {
     let mut certified = CertifiedCell::of(3);
     certified.cell.forget_events();
     for round in 0..60 {

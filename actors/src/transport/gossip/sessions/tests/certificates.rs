@@ -70,7 +70,7 @@ fn change_attestation(body: &mut Vec<u8>, change: impl FnOnce(&mut Attestation))
 }
 
 #[test]
-fn nodes_with_certificates_understand_each_other_and_know_each_others_rights() {
+fn certified_nodes_exchange_rights() {
     let (_authority, mut a, mut b) = two();
     introduce(&mut a, &mut b);
     assert_both_heard(&mut a, &mut b);
@@ -85,7 +85,7 @@ fn nodes_with_certificates_understand_each_other_and_know_each_others_rights() {
 }
 
 #[test]
-fn every_frame_of_the_longest_names_fits_a_datagram() {
+fn longest_frame_fits_datagram() {
     let mut authority = TrialAuthority::new();
     let names: [&'static str; 2] = ["a", "b"].map(|letter| &*letter.repeat(64).leak());
     let [mut a, mut b] = [(names[0], 1), (names[1], 2)].map(|(name, session)| {
@@ -111,7 +111,7 @@ fn every_frame_of_the_longest_names_fits_a_datagram() {
 
 /// The former defect: a holder of the cell's key muted a link by one frame with the last counter.
 #[test]
-fn the_cells_key_alone_reads_and_forges_nothing() {
+fn cell_key_alone_cannot_forge() {
     let (_authority, mut a, mut b) = two();
     introduce(&mut a, &mut b);
     let key = cell_key();
@@ -138,7 +138,7 @@ fn the_cells_key_alone_reads_and_forges_nothing() {
 }
 
 #[test]
-fn a_node_without_certificate_is_not_admitted_and_counted() {
+fn node_without_certificate_is_refused() {
     let (_authority, mut a, _) = two();
     let mut bare = End::new("b", 2);
     let hello = bare.hello();
@@ -156,7 +156,7 @@ fn a_node_without_certificate_is_not_admitted_and_counted() {
 }
 
 #[test]
-fn a_certificate_of_another_ca_or_name_is_not_admitted() {
+fn foreign_certificate_is_refused() {
     let (mut authority, mut a, mut b) = two();
     let mut strange = node(&mut TrialAuthority::new(), "euclid", 3);
     let forged = proof(&mut strange, &mut b);
@@ -185,7 +185,7 @@ fn a_certificate_of_another_ca_or_name_is_not_admitted() {
 }
 
 #[test]
-fn a_revoked_certificate_is_not_admitted_and_ends_its_session() {
+fn revoked_certificate_ends_session() {
     let (mut authority, mut a, mut b) = two();
     introduce(&mut a, &mut b);
     authority.revoke(&a.id.name);
@@ -203,7 +203,7 @@ fn a_revoked_certificate_is_not_admitted_and_ends_its_session() {
 }
 
 #[test]
-fn an_expired_certificate_ends_its_session() {
+fn expired_certificate_ends_session() {
     let mut authority = TrialAuthority::new();
     let files = authority.issue("a", Role::Auto, Duration::from_secs(60));
     let mut a = End::with("a", 1, Some(TrialAuthority::read(&files, "a")));
@@ -222,7 +222,7 @@ fn an_expired_certificate_ends_its_session() {
 }
 
 #[test]
-fn a_repeated_or_altered_proof_disturbs_nothing() {
+fn repeated_proof_has_no_effect() {
     let (_authority, mut a, mut b) = two();
     let [_, _, first, _] = introduce(&mut a, &mut b);
     assert_both_heard(&mut a, &mut b);
@@ -254,7 +254,7 @@ fn a_repeated_or_altered_proof_disturbs_nothing() {
 
 /// A man in the middle has the cell's key and a certificate of his own.
 #[test]
-fn swapped_ephemerals_and_certificates_are_noticed() {
+fn swapped_handshake_parts_are_refused() {
     let (mut authority, mut a, mut b) = two();
     let eve = node(&mut authority, "eve", 6);
     let Some(prover) = &eve.sessions.prover else {
@@ -309,7 +309,7 @@ fn swapped_ephemerals_and_certificates_are_noticed() {
 
 /// The holder of one certificate invents any number of observers.
 #[test]
-fn one_certificate_does_not_fill_the_table() {
+fn one_certificate_cannot_fill_table() {
     let mut authority = TrialAuthority::new();
     let mut b = node(&mut authority, "b", 200);
     b.sessions.peers = PeerTable::new(256);
@@ -343,7 +343,7 @@ fn reflected_frames_are_refused() {
 /// Both sides start a handshake at once. In any order, and if one accept is lost, both can open
 /// each other's frames.
 #[test]
-fn two_handshakes_at_once_leave_both_understood() {
+fn simultaneous_handshakes_open_one_session() {
     for (a_hears, b_hears) in [(true, true), (true, false), (false, true)] {
         let (_authority, mut a, mut b) = two();
         let to_b = proof(&mut a, &mut b);
@@ -407,7 +407,7 @@ fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
 }
 
 #[test]
-fn forged_challenges_hold_up_no_other_node_and_no_session_that_is_there() {
+fn forged_challenges_delay_no_session() {
     let mut authority = TrialAuthority::new();
     let [mut a, mut b, mut c] =
         [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));

@@ -74,7 +74,7 @@ fn certificate(path: PathBuf) -> CertificateDer<'static> {
 }
 
 #[test]
-fn a_vehicle_of_the_city_takes_part_in_every_cell_and_leads_in_none() {
+fn city_vehicle_joins_without_leading() {
     let mut city = City::new();
     let [euclid, edge] = ["euclid", "edge"].map(NodeName::from_static);
     city.city
@@ -117,7 +117,7 @@ fn a_vehicle_of_the_city_takes_part_in_every_cell_and_leads_in_none() {
 }
 
 #[test]
-fn a_stolen_key_of_a_cell_lets_nobody_into_another_even_with_its_chain() {
+fn stolen_key_opens_one_cell() {
     let mut city = City::new();
     let edge = NodeName::from_static("edge");
     for cell in &mut city.cells {
@@ -192,7 +192,7 @@ fn overstate(city: &City, node: &NodeName) {
 }
 
 #[test]
-fn a_vehicle_of_the_city_leads_nowhere_whatever_its_certificate_says() {
+fn certificate_cannot_make_city_vehicle_leader() {
     let mut city = City::new();
     let [euclid, edge] = ["euclid", "edge"].map(NodeName::from_static);
     city.city
@@ -239,7 +239,7 @@ fn a_vehicle_of_the_city_leads_nowhere_whatever_its_certificate_says() {
 }
 
 #[test]
-fn authorities_of_one_name_are_told_apart_with_their_lists() {
+fn same_named_authorities_are_distinguished() {
     let directory = tempfile::tempdir().unwrap();
     let at = |name: &str| directory.path().join(name);
     let town = NodeName::from_static("town");
@@ -300,7 +300,7 @@ fn authorities_of_one_name_are_told_apart_with_their_lists() {
 }
 
 #[test]
-fn nothing_of_a_cell_whose_ca_the_city_has_revoked_counts_and_vehicles_stay() {
+fn revoked_cell_ca_invalidates_cell_only() {
     let mut city = City::new();
     let [euclid, edge] = ["euclid", "edge"].map(NodeName::from_static);
     city.city
@@ -336,7 +336,7 @@ fn nothing_of_a_cell_whose_ca_the_city_has_revoked_counts_and_vehicles_stay() {
 }
 
 #[test]
-fn a_ca_that_the_city_has_not_signed_is_told_with_the_remedy() {
+fn unsigned_ca_names_remedy() {
     let mut city = City::new();
     let edge = NodeName::from_static("edge");
     city.cells[0]
