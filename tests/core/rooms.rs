@@ -78,6 +78,74 @@ fn type_names_are_unique() {
     );
 }
 
+/// Folders of tests in addition to the crates' sources.
+const TESTS: [&str; 6] = [
+    "tests",
+    "actors/tests",
+    "clients/rust/tests",
+    "interop/tests",
+    "lab/tests",
+    "region/tests",
+];
+
+/// Maximum of the median number of words in the name of a test, and of the number itself.
+const MEDIAN_WORDS: usize = 5;
+const MAX_WORDS: usize = 8;
+
+#[test]
+fn test_names_are_short() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut names = TestNames::default();
+    for folder in CRATES.iter().map(|(_, sources)| sources).chain(&TESTS) {
+        names.read(&root.join(folder));
+    }
+    names.0.sort_by_key(|name| words(name));
+    assert!(names.0.len() > 1000, "the sources were read");
+    let longest = names.0.last().unwrap();
+    assert!(words(longest) <= MAX_WORDS, "{longest}");
+    let median = &names.0[names.0.len() / 2];
+    assert!(
+        words(median) <= MEDIAN_WORDS,
+        "half of the names are longer than {median}"
+    );
+}
+
+fn words(name: &str) -> usize {
+    name.split('_').count()
+}
+
+/// Names of functions with an attribute `test`, also one of tokio.
+#[derive(Default)]
+struct TestNames(Vec<String>);
+
+impl TestNames {
+    fn read(&mut self, folder: &Path) {
+        for path in fs::read_dir(folder)
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+        {
+            if path.is_dir() {
+                self.read(&path);
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                let file = syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap();
+                self.visit_file(&file);
+            }
+        }
+    }
+}
+
+impl<'ast> Visit<'ast> for TestNames {
+    fn visit_item_fn(&mut self, function: &'ast syn::ItemFn) {
+        let is_test = function.attrs.iter().any(|attribute| {
+            let last = attribute.path().segments.last();
+            last.is_some_and(|segment| segment.ident == "test")
+        });
+        if is_test {
+            self.0.push(function.sig.ident.to_string());
+        }
+    }
+}
+
 #[test]
 fn cycle_is_found_and_named() {
     let graph = |edges: &[(&str, &str)]| {
