@@ -294,7 +294,7 @@ impl ForeignObjects {
         looked_at.map(|object| &mut object.track)
     }
 
-    /// True if there is none.
+    /// True if no neighbouring cell has an object.
     pub(super) fn is_empty(&self) -> bool {
         self.objects.is_empty()
     }
@@ -335,8 +335,8 @@ impl ForeignObjects {
             (is_near && detected.is_none_or(is_like))
                 .then_some((innovation.distance_squared, object))
         });
-        // A cell that is not believed, or copies identities, must not stand before others. One that is not proven lends only
-        // what it can be judged by.
+        // A distrusted cell, or a cell that copies identities, must not take precedence over other cells. From an unproven
+        // cell only objects that this cell can verify are used.
         let usable = near.filter(|(_, object)| {
             let trust = self.trust.of(&object.cell);
             let is_believed = trust.trust(fleet.reputation()) > 0.0;

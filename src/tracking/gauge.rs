@@ -1,11 +1,10 @@
 //! Gauge of the registration: a shift, a rotation and a delay that the errors of all observers have in common.
 //!
-//! Observers find their errors relative to each other. A motion of all together changes no residual, so nothing but
-//! unequal gains decides on it, and it would wander without end. Therefore a round leaves the common motion of
-//! observers that correspond, directly or through others, as it was. It only fades with the mean of the errors: those of
-//! observers that leave or join do not move the map at once. If each faded by itself, those that last would take over
-//! the errors of those that fade. What a group has in common is the [`Consensus`] of most observers: the errors of a minority
-//! do not count as common.
+//! Observers estimate their errors relative to each other. A motion common to all observers changes no residual and would
+//! drift because of unequal gains. A round therefore keeps the mean error of each connected group (observers that
+//! correspond, directly or through others) and lets only this mean decay, so that an observer that joins or leaves does
+//! not shift the map at once. If each error decayed separately, the remaining observers would take over the errors of the
+//! others. The mean of a group is the [`Consensus`] of most observers, which excludes the errors of a minority.
 
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 

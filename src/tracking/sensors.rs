@@ -27,16 +27,17 @@ const DECLARED_STAYS: f64 = 1.0;
 /// Range in metres that counts at least: that of a vehicle that detects nothing shrinks.
 const MIN_RANGE_M: f64 = 10.0;
 
-/// Time after which a vehicle that states no pose and stays is known to stand.
+/// Time after which a vehicle without a pose whose detections stay in place counts as standing.
 const STAYS_FOR: Duration = Duration::from_secs(120);
 
-/// Consistency of a vehicle's errors with those of most others below which the places that it states are judged.
+/// The positions that a vehicle reports are judged if the consistency of its pose errors with the errors of most other
+/// vehicles is below this value.
 const MIN_CONSISTENCY: f64 = 0.1;
 
 /// Normalised squared error, of two dimensions, that 1 % of the places exceed.
 const CERTAIN_SQUARED: f64 = 9.21;
 
-/// Models of the vehicles that are heard, and the trust in all.
+/// Models of all vehicles that report, and their trust.
 #[derive(Debug, Clone)]
 pub(super) struct Sensors {
     models: Vec<Option<Box<SensorModel>>>,
@@ -115,8 +116,8 @@ impl Sensors {
         self.models.iter_mut().flatten().map(Box::as_mut)
     }
 
-    /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
-    /// it have none.
+    /// Adopts the counts of all vehicles from a ledger, limited to its latest votes. Vehicles missing in the ledger start
+    /// without counts.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
         let config = self.fleet.reputation();
         let votes = ledger

@@ -1,9 +1,10 @@
 //! Trust in vehicles: which of them report objects that others see, and which fabricate or hide objects.
 //!
-//! Every [`JUDGED_AFTER`] of looks, a vehicle's statement about an object is compared with the evidence of the others.
-//! Where they agree that the object exists, a detection is correct; not to have detected it since the last judgement is a
-//! miss if most of the others that look detect it, and most vehicles detect objects at that distance. Where at least two others
-//! look and agree that nothing exists, a detection is a false positive. One vehicle against another settles nothing.
+//! Every [`JUDGED_AFTER`] of observations, a vehicle's statement about an object is compared with the evidence of the
+//! others. If the others agree that the object exists, a detection counts as correct. No detection since the last
+//! judgement counts as a miss if most of the others that observe the place detect the object, and most vehicles detect
+//! objects at that distance. If at least two others observe the place and agree that it is empty, a detection counts as
+//! a false positive. Two vehicles that disagree yield no judgement.
 
 use std::collections::BTreeMap;
 

@@ -125,7 +125,7 @@ async fn refused_reports_make_vehicle_unready() {
     until_told(
         page,
         ["euclid", "", "reports_refused"],
-        "edge says of this node: report rejected: objects[0].x_m",
+        "reported by edge: report rejected: objects[0].x_m",
     )
     .await;
     let ready = get(page, "/readyz").await;
@@ -134,7 +134,7 @@ async fn refused_reports_make_vehicle_unready() {
         ready.json()["reason"]
             .as_str()
             .unwrap()
-            .starts_with("edge says of this node"),
+            .starts_with("reported by edge"),
         "{}",
         ready.body
     );
@@ -156,9 +156,9 @@ async fn who_is_alone_says_why() {
     // The edge hears the greetings of a seed; it does not greet itself.
     until("the edge names the other cell", || async {
         let troubles = edge.troubles();
-        troubles
-            .iter()
-            .any(|(_, trouble)| trouble.cause == "heard cell lott from 127.0.0.1, this is lot")
+        troubles.iter().any(|(_, trouble)| {
+            trouble.cause == "received a datagram of cell lott from 127.0.0.1; this node is in lot"
+        })
     })
     .await;
     let mut unresolved = config("gauss", Role::Cav, 1);

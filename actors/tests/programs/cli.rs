@@ -490,7 +490,10 @@ fn cameraless_vehicle_expects_program_reports() {
     node.stdin(Stdio::piped()).stderr(Stdio::piped());
     let mut node = node.spawn().unwrap();
     let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
-    assert!(log.any(|line| line.unwrap().contains("only programs beside it report")));
+    assert!(log.any(|line| {
+        line.unwrap()
+            .contains("only other programs of this vehicle can report")
+    }));
     drop(node.stdin.take());
     assert!(node.wait().unwrap().success());
 }

@@ -390,7 +390,7 @@ impl Sessions {
     /// Records a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
         let cause = format!(
-            "heard cell {} with another key, or none, from {}",
+            "received a datagram of cell {} with another key or none from {}",
             self.cell,
             from.ip()
         );
@@ -408,7 +408,7 @@ impl Sessions {
         };
         if !are_numbered(other, &self.cell) || arrival.is_alone {
             let cause = format!(
-                "heard cell {other} from {}, this is {}",
+                "received a datagram of cell {other} from {}; this node is in {}",
                 arrival.from.ip(),
                 self.cell
             );

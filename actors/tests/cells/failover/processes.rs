@@ -87,7 +87,7 @@ fn vehicles_survive_edge_kill() {
     edge_is_killed(&directory);
 }
 
-/// The same with TLS between all: a broken connection and a refused port say as much as they do without.
+/// With TLS, a broken connection and a refused port are detected as quickly as without TLS.
 #[test]
 fn certified_vehicles_survive_edge_kill() {
     let directory = tempfile::tempdir().unwrap();
@@ -100,8 +100,8 @@ fn certified_vehicles_survive_edge_kill() {
     edge_is_killed(&directory);
 }
 
-/// A second run under the name of a running vehicle takes no part: it says why, and ends by itself with a code of its
-/// own. Neither its coming nor its going touches the lead or costs a map.
+/// A second process with the name of a running vehicle does not join, logs the reason, and exits with a separate code.
+/// Its start and its end do not affect the leadership or delay a map.
 #[test]
 fn second_process_of_name_exits() {
     let directory = tempfile::tempdir().unwrap();
