@@ -107,8 +107,8 @@ pub struct LedgerEntry {
     pub incorrect: u64,
 }
 
-/// Snapshot of one vehicle's counts, taken when the number of its votes under this leadership reached a
-/// multiple of 32. A snapshot is not changed later.
+/// Snapshot of one vehicle's counts, taken when the number of its votes under this leadership
+/// reached a multiple of 32. A snapshot is not changed later.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerMark {
     /// Term of the leadership that counted.
