@@ -56,7 +56,7 @@ async fn cav(node: &str, edge: &NodeHandle) -> NodeHandle {
     attached(node, Role::Cav, edge, |_| ()).await
 }
 
-/// A node that finds the cell by its gossip and uses the brokers of whoever leads.
+/// A node that finds the cell by its gossip and uses the brokers of the leader.
 async fn member(
     node: &str,
     role: Role,
@@ -84,7 +84,7 @@ fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
     })
 }
 
-/// Has two vehicles say cup and a third say dog, all over the third's connection to the broker.
+/// Makes two vehicles vote cup and a third vote dog, all over the third vehicle's connection to the broker.
 fn disagree(reporter: &NodeHandle) {
     for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
         let message = GatewayMessage::PublishReport {
@@ -289,7 +289,7 @@ async fn restarted_parts_keep_reputations() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn next_leader_keeps_reputations() {
     let edge = edge(|_| ()).await;
-    // It never settles a vote itself: what it knows, it was told.
+    // This node does not settle votes itself: all its evidence was received.
     let standby = member("standby", Role::Auto, &edge, |config| {
         config.fusion.vote.weighted.freshness_s = 1e9;
     })
@@ -310,7 +310,7 @@ async fn next_leader_keeps_reputations() {
         || standby.counters().events(Event::LedgerMerged) > 2,
     )
     .await;
-    // The last votes are settled and published when nothing new has come for a second, and the standby knows the same.
+    // The last votes are settled and published after a second without new votes, and the standby has equal evidence.
     let mut last = from_edge().unwrap();
     let mut since = Instant::now();
     let known = |node: &NodeHandle| reputations(node).map(|newest| newest.reputations.clone());
@@ -345,7 +345,7 @@ async fn next_leader_keeps_reputations() {
     )
     .await;
 
-    // A candidate that was not there before is told all.
+    // A candidate that joins later receives all evidence.
     let late = member("late", Role::Auto, &standby, |_| ()).await;
     let tell = || {
         standby

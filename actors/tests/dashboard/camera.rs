@@ -31,7 +31,7 @@ pub(crate) fn seeing(directory: &Path) -> NodeConfig {
     }
 }
 
-/// The same with a camera to the rear, before which a dog stands.
+/// A second camera to the rear, with a dog in front of it.
 pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
     let mut both = seeing(directory);
     let mut rear = camera(
@@ -241,7 +241,7 @@ async fn box_and_object_highlight_together() {
     node.stop().await;
 }
 
-/// Each camera's pictures are of their own, and made while somebody looks at that camera.
+/// Each camera has separate pictures, which are made only while a reader views that camera.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn camera_name_selects_pictures() {
     let directory = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Whether machines are told the truth about the node.
+//! Health checks for machines are correct.
 
 use std::net::TcpListener;
 

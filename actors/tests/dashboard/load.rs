@@ -1,4 +1,4 @@
-//! Browsers that behave badly cost the cell nothing.
+//! Browsers that misbehave do not disturb the cell.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -33,7 +33,7 @@ async fn longest_gap<T>(node: &NodeHandle, during: impl Future<Output = T>) -> (
     }
 }
 
-/// Far more than a round's period, far less than what a cell that waits for its browsers would take.
+/// Far longer than a round's period, far shorter than the delay of a cell that waits for its browsers.
 const MOST: Duration = Duration::from_secs(2);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -120,7 +120,7 @@ async fn flood(page: SocketAddr, requests: usize) {
     }
 }
 
-/// Whoever does not know the token takes no answers from those who do.
+/// Requests without the token do not take answers from requests with it.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn tokenless_flood_delays_no_user() {
     let mut config = config("euclid", Role::Auto, 1);
@@ -176,7 +176,7 @@ async fn silent_connections_are_displaced() {
     node.stop().await;
 }
 
-/// A page looks at live pictures and asks for more now and then, on connections that browsers would keep.
+/// A page receives live pictures and sends further requests now and then, on connections that browsers would keep.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pages_leave_room_for_scrapers() {
     let mut config = config("euclid", Role::Auto, 1);

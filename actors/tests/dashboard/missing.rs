@@ -118,7 +118,7 @@ async fn crashed_node_stays_missing() {
     cell.stop().await;
 }
 
-/// `ecod-node cell dismiss` at a node's door: whether it succeeded, and what it printed.
+/// `ecod-node cell dismiss` at a node's door: whether it succeeded, and its output.
 async fn dismiss(door: SocketAddr, node: &'static str) -> (bool, String) {
     let run = move || {
         let mut program = command(env!("CARGO_BIN_EXE_ecod-node"));

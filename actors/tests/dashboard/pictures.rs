@@ -75,7 +75,7 @@ async fn every_node_page_shows_cell() {
     cav.stop().await;
 }
 
-/// Neither the edge nor a plain client can be told of any more by the broker that died with the edge.
+/// The edge and a plain client cannot receive more messages from the broker that ended with the edge.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn dead_brokers_clients_are_removed() {
     let directory = tempfile::tempdir().unwrap();
@@ -134,7 +134,7 @@ async fn say_there_is(name: &'static str, broker: SocketAddr) {
     }
 }
 
-/// A vehicle's report reaches a node that only follows while someone looks there, and no longer.
+/// A vehicle's report reaches a following node only while a reader views it there.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn unviewed_follower_receives_no_reports() {
     let (edge, _) = start(config("edge", Role::Edge, 6)).await;

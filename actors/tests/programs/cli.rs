@@ -1,4 +1,4 @@
-//! The program as a newcomer meets it: what it accepts, what it prints, and what it says when something is wrong.
+//! The program as a newcomer uses it: its arguments, its output, and its errors.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Output, Stdio};
@@ -532,7 +532,7 @@ fn misplaced_command_names_its_program() {
     );
 }
 
-/// From nothing to a node with certificates, and what it says when they are another's.
+/// From an empty directory to a node with certificates, and its output for certificates of another node.
 #[test]
 fn certificate_commands_work() {
     let directory = tempfile::tempdir().unwrap();
@@ -636,7 +636,7 @@ fn stopped_node_resets_evidence() {
     );
 }
 
-/// As a package installs them: the program, and beside it one without OpenCV.
+/// The files of a package: the program, and the smaller program without OpenCV.
 #[test]
 fn cameraless_node_avoids_opencv() {
     let prefix = tempfile::tempdir().unwrap();

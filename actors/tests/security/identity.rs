@@ -38,7 +38,7 @@ fn seen_by(node: &Member) -> Vec<(String, Role)> {
         .collect()
 }
 
-/// All declare to be an edge; what others see is what their certificates allow.
+/// All declare to be an edge; other nodes use the roles that the certificates allow.
 #[tokio::test]
 async fn nodes_meet_only_with_certificates() {
     let mut pki = Pki::new();

@@ -77,7 +77,7 @@ impl Write for Log {
     }
 }
 
-/// Sessions of the membership go on by the former certificate. New connections meet the other one.
+/// Sessions of the membership continue with the former certificate. New connections use the other certificate.
 #[tokio::test]
 async fn followers_skip_distrusted_leader() {
     let mut pki = Pki::new();
@@ -85,7 +85,7 @@ async fn followers_skip_distrusted_leader() {
     let files = pki.issue_three();
     let foreign = elsewhere.issue("edge", Role::Edge, DAY);
     let tls = client_config("gauss", &files[2]);
-    // The edge alone trusts the other CA.
+    // Only the edge trusts the other CA.
     let own = TlsConfig {
         ca: files[0].ca.with_file_name("both.pem"),
         revocation_list: None,

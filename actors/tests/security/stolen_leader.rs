@@ -1,4 +1,4 @@
-//! A leader whose certificate is revoked while it leads, and which does not know it: its own list stays as it was.
+//! A leader whose certificate is revoked while it leads, without its knowledge: its own list remains unchanged.
 
 use std::time::Duration;
 

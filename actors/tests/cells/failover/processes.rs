@@ -1,4 +1,4 @@
-//! The same with processes of their own.
+//! The tests of `failover` with separate processes.
 
 use std::fs::File;
 use std::net::SocketAddr;
@@ -133,7 +133,7 @@ fn second_process_of_name_exits() {
         let reason =
             "another running node of the cell cell is called euclid: give one of them another name";
         assert!(said.contains(reason), "{said}");
-        // By itself it may lead itself, until it has heard long enough that its name is taken.
+        // It may lead alone until it has received long enough that its name is taken.
         assert_ne!(
             Record::read(&elsewhere.path().join("euclid.maps")).source(),
             Some("edge"),
@@ -175,7 +175,7 @@ fn edge_is_killed(directory: &TempDir) {
     until("the edge serves all", &|record| {
         !record.is_empty() && record.source() == Some("edge")
     });
-    // Time to be told who stands by, and to connect to it.
+    // Time until the node has the name of the standby and a connection to it.
     std::thread::sleep(Duration::from_secs(2));
     drop(edge);
     until("a vehicle serves all", &|record| {

@@ -127,7 +127,7 @@ async fn outputs_survive_leader_kill() {
             .all(|display| votes_of(display, "edge", "euclid") > 3)
     })
     .await;
-    // The last votes become evidence, which the edge tells the others.
+    // The last votes become evidence, which the edge sends to the others.
     sleep(Duration::from_secs(3)).await;
     let before: Vec<_> = displays
         .iter()

@@ -32,7 +32,7 @@ async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
     .await;
 }
 
-/// A node's subscription is known to be in force once another's retained status has come through it.
+/// A node's subscription is active once another node's retained status has arrived through it.
 async fn settle(receiver: &mut Node, sender: &Node) {
     sender.send(GatewayMessage::PublishStatus {
         status: sender.status.clone(),
@@ -306,7 +306,7 @@ async fn missing_echoes_reveal_hanging_broker() {
     for version in [MqttVersion::V311, MqttVersion::V5] {
         let broker = Mosquitto::start();
         let address = broker.address();
-        // Long enough for the protocol's own signs of life to tell nothing in here.
+        // Long enough that the protocol's own keep-alive does not occur in this time.
         let mqtt = MqttConfig {
             version,
             keep_alive_s: 600,
@@ -323,7 +323,7 @@ async fn missing_echoes_reveal_hanging_broker() {
         tokio::time::sleep(Duration::from_secs(2)).await;
         broker.freeze();
         let frozen = Instant::now();
-        // Whatever was said of the link so far is that it came up: that was taken by `join`.
+        // The only event of the link so far is that it came up, which `join` consumed.
         let stalled = edge.next(|message| match message {
             Incoming::Link { state, .. } => Some(*state),
             _ => None,

@@ -89,7 +89,7 @@ async fn living_namesakes_are_reported() {
         })
         .await;
     }
-    // Whatever was said in the meantime came before this.
+    // All messages of the meantime came before this message.
     watcher.send(GatewayMessage::PublishStatus {
         status: watcher.status.clone(),
     });

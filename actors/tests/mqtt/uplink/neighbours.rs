@@ -1,4 +1,4 @@
-//! Two cells beside each other.
+//! Two neighbouring cells.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -117,7 +117,7 @@ async fn neighbours_nearby_objects_are_mapped() {
         );
         assert!(north.counters().events(Event::CellMapAccepted) > 10);
 
-        // Strangers are counted by cell, and change nothing.
+        // Unknown cells are counted by cell, without an effect.
         let tile = Quadkey::of_cell(&ORIGIN);
         let kind = RegionTopicKind::Map;
         let of = |cell| RegionTopic {
