@@ -1,7 +1,10 @@
 //! Messages arrive faster than they are processed: only their sender is affected. Alone in its process, whose memory is
 //! measured.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test that cannot continue panics at that line"
+)]
 
 use std::net::SocketAddr;
 use std::num::NonZero;
@@ -153,7 +156,7 @@ async fn flood_delays_no_other_reports() {
     let flooded = sorted_times(&answers);
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
-    println!("median {quiet_median:?}, beside a flood {flooded_median:?}; {left_out} left out");
+    println!("median {quiet_median:?}, during a flood {flooded_median:?}; {left_out} left out");
     assert!(
         flooded_median < quiet_median + Duration::from_millis(50),
         "{quiet:?} {flooded:?}"

@@ -22,7 +22,7 @@ pub(crate) fn draw(
     path: &Path,
     courses: &[(usize, [Figures; METHODS.len()])],
 ) -> anyhow::Result<()> {
-    let last = courses.len().checked_sub(1).context("nothing to draw")?;
+    let last = courses.len().checked_sub(1).context("no figures to draw")?;
     let area = SVGBackend::new(path, (960, 640)).into_drawing_area();
     area.fill(&WHITE)?;
     let (legend, panels) = area.split_vertically(30);

@@ -121,7 +121,7 @@ async fn carry_out(step: &Step, cell: &mut Cell) -> anyhow::Result<String> {
             format!("{} started", missing.join(", "))
         }
         Step::KillLeader => {
-            let epoch = cell.epoch().context("nobody leads")?;
+            let epoch = cell.epoch().context("no leader")?;
             cell.kill(epoch.leader.as_str())?;
             format!("{} killed", epoch.leader)
         }

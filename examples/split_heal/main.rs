@@ -206,7 +206,7 @@ impl Cell {
             };
             let held: Vec<_> = self.vehicles.iter().map(held).collect();
             println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
-            ensure!(*settled > 0, "{epoch} settled nothing");
+            ensure!(*settled > 0, "{epoch} settled no votes");
             ensure!(
                 held.iter().all(|held| held == settled),
                 "evidence of {epoch} was lost or counted twice"

@@ -543,7 +543,7 @@ fn equal_input_gives_equal_identities() {
         .unwrap();
     assert!(taken_over.existence.unwrap() > 0.8, "{taken_over:?}");
     let later = two_cars(&mut newcomer, 31..80, |_| true);
-    assert_eq!(later.objects.len(), 2, "a map alone keeps nothing alive");
+    assert_eq!(later.objects.len(), 2, "a map alone does not keep tracks");
 }
 
 #[test]

@@ -62,7 +62,7 @@ fn type_names_are_unique() {
                 syn::Item::Type(item) => (item.ident, item.attrs),
                 _ => continue,
             };
-            // One of two synonyms.
+            // Items with `cfg` are alternatives of one item.
             if !attributes
                 .iter()
                 .any(|attribute| attribute.path().is_ident("cfg"))

@@ -44,7 +44,7 @@ fn replayed(lines: &[ObjectReport]) -> (Vec<GlobalMap>, Summary) {
     output.extend(rest);
     let map = |line| match line {
         FusedLine::Map(map) => map,
-        FusedLine::Verdicts(verdicts) => panic!("nobody voted: {verdicts:?}"),
+        FusedLine::Verdicts(verdicts) => panic!("there are no votes: {verdicts:?}"),
     };
     (output.into_iter().map(map).collect(), summary)
 }

@@ -158,7 +158,7 @@ async fn each_ended_source_is_trouble() {
         };
         timeout(Duration::from_secs(10), told)
             .await
-            .expect("the end is told");
+            .expect("the end is reported");
         node.stop().await;
     }
 }

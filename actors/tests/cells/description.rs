@@ -272,7 +272,7 @@ async fn configuration_spreads_within_two_rounds() {
             now.objects.iter().any(|object| object.id == car),
             "the same track"
         );
-        assert_eq!(now.epoch, before.epoch, "nothing restarted");
+        assert_eq!(now.epoch, before.epoch, "no restart");
         let mut verdicts = gauss.newest_verdicts();
         let after = verdicts.wait_for(|newest| {
             newest

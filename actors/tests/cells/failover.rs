@@ -158,7 +158,7 @@ async fn leader_with_silent_broker_yields() {
         assert_eq!(
             cell.leadership("gauss").position,
             Position::Leading,
-            "there is nobody to make way for"
+            "there is no other candidate for the lead"
         );
         assert_eq!(cell.leadership("gauss").epoch, epoch);
     }

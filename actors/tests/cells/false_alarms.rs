@@ -281,7 +281,7 @@ async fn every_trouble_has_its_cause() {
     std::fs::write(&log, "a file").unwrap();
     watched
         .cell
-        .until("nothing is recorded", |_| {
+        .until("recording has stopped", |_| {
             watched.is_shown(["not_recorded", ""]).then_some(())
         })
         .await;

@@ -157,7 +157,7 @@ async fn datagrams_reach_other_nodes() {
         _ => false,
     };
     let arrived = async {
-        // A report that waits for a session too long is lost.
+        // A message that waits for a session too long is lost.
         while !nodes[4].events().iter().any(received) {
             let to = nodes[4].name.clone();
             nodes[1]

@@ -308,7 +308,7 @@ async fn earth_poses_use_cell_origin() {
         "no origin",
         "ecod-node cell set",
     ];
-    until("that is told", async || {
+    until("the trouble is reported", async || {
         let answer = readiness(&standing).await;
         told.iter().all(|part| answer.contains(part))
     })

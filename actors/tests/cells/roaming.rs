@@ -400,7 +400,11 @@ async fn vehicle_reports_in_one_cell() {
     assert!(missed <= 1, "{missed} maps missed");
     let left = first.count();
     second.more().await;
-    assert_eq!(first.count(), left, "the former cell hears no more of it");
+    assert_eq!(
+        first.count(),
+        left,
+        "the former cell receives no more reports"
+    );
     town.drive_to(0.0);
     first.more().await;
     let vehicle = vehicle.stop().await;

@@ -119,7 +119,12 @@ async fn unmasked(reporter: &NodeHandle, receiver: &NodeHandle) {
         reputation(receiver, "liar").is_some_and(|liar| liar.incorrect >= 5)
             && reputation(receiver, "euclid").is_some_and(|euclid| euclid.correct >= 5)
     };
-    until("the liar unmasked", || disagree(reporter), settled).await;
+    until(
+        "the malicious vehicle is detected",
+        || disagree(reporter),
+        settled,
+    )
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -177,11 +182,13 @@ async fn retained_reputations(edge: &NodeHandle) -> Reputations {
             }
         }
     };
-    let publish = timeout(PATIENCE, first).await.expect("nothing is retained");
+    let publish = timeout(PATIENCE, first)
+        .await
+        .expect("no message is retained");
     assert_eq!(
         publish.qos,
         rumqttc::QoS::AtMostOnce,
-        "an embedded broker holds nothing for acknowledgements"
+        "an embedded broker keeps no messages for acknowledgement"
     );
     decode(&publish.payload, &Default::default()).unwrap()
 }
@@ -303,7 +310,12 @@ async fn next_leader_keeps_reputations() {
                 .is_some_and(|l| l.incorrect >= 5)
         })
     };
-    until("the liar unmasked", || disagree(&euclid), settled).await;
+    until(
+        "the malicious vehicle is detected",
+        || disagree(&euclid),
+        settled,
+    )
+    .await;
     until(
         "evidence replicated",
         || disagree(&euclid),

@@ -132,7 +132,7 @@ async fn browser_follows_new_leader() {
         .await;
     assert_eq!(
         said, "Connection lost",
-        "and nothing that changes every second"
+        "and no text that changes every second"
     );
     let chart = browser
         .evaluate("Number(getComputedStyle(document.querySelector('#latency-chart')).opacity)")
@@ -352,7 +352,7 @@ async fn wrong_position_distorts_no_map() {
     assert_eq!(
         browser.evaluate(&format!("{width} > 300")).await,
         true,
-        "a vehicle that sees nothing rules nothing"
+        "a vehicle without detections does not scale the map"
     );
     stray.report(FAR_M, 1.0).await;
     tokio::time::sleep(Duration::from_secs(1)).await;

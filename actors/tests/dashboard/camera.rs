@@ -31,7 +31,7 @@ pub(crate) fn seeing(directory: &Path) -> NodeConfig {
     }
 }
 
-/// A second camera to the rear, with a dog in front of it.
+/// The node with a second camera to the rear, which detects a dog.
 pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
     let mut both = seeing(directory);
     let mut rear = camera(
@@ -97,7 +97,11 @@ async fn pictures_need_viewers() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing(directory.path())).await;
     sees_objects(page).await;
-    assert_eq!(node.counters().events(Event::FrameShown), 0, "nobody looks");
+    assert_eq!(
+        node.counters().events(Event::FrameShown),
+        0,
+        "without a viewer"
+    );
 
     let mut pictures = Events::open_at(page, "/api/camera").await;
     let picture = pictures.next().await;

@@ -78,7 +78,7 @@ async fn non_reading_browsers_are_dropped() {
         reader.next().await;
     })
     .await;
-    println!("longest time between two maps beside 8 browsers that never read: {gap:?}");
+    println!("longest time between two maps with 8 browsers that do not read: {gap:?}");
     assert!(gap < MOST, "{gap:?}");
     node.stop().await;
 }
@@ -98,13 +98,13 @@ async fn browser_message_flood_is_limited() {
         }
     })
     .await;
-    println!("longest time between two maps beside 10,000 requests: {gap:?}");
+    println!("longest time between two maps with 10,000 requests: {gap:?}");
     assert!(gap < MOST, "{gap:?}");
     assert!(node.counters().events(Event::BrowserThrottled) > 1000);
     assert_eq!(
         get(page, "/healthz").await.status,
         200,
-        "health is told all the same"
+        "health is still answered"
     );
     until("pages are served again", || async {
         get(page, "/").await.status == 200

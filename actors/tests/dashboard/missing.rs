@@ -106,7 +106,7 @@ async fn crashed_node_stays_missing() {
         "{said}"
     );
     for page in pages {
-        until("nothing is missing", || async {
+        until("no node is missing", || async {
             missing(page).await.is_empty()
         })
         .await;

@@ -213,7 +213,7 @@ async fn history_lists_leaders_and_gaps() {
         "{history}"
     );
     assert!(history["failovers"].as_u64() >= Some(1), "{history}");
-    until("the edge's end is told", || async {
+    until("the edge's end is shown", || async {
         let history = get(page, "/api/history").await.json();
         history["events"]
             .as_array()

@@ -104,7 +104,7 @@ async fn leader_troubles_reach_every_page() {
         "{metrics}"
     );
     drop((watson, late));
-    until("both are forgotten", || async {
+    until("both entries are removed", || async {
         told(edge_page).await.is_empty() && told(page).await.is_empty()
     })
     .await;

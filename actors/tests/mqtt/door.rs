@@ -453,7 +453,7 @@ async fn external_broker_keeps_broker_port() {
         assert_eq!(
             cell.node(name).broker_address(),
             None,
-            "no node is told of a door"
+            "no node receives the address of a door"
         );
         let program = Program::connect("lidar", cell.door(name), &["global_detections"]).await;
         reported(

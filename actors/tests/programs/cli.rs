@@ -605,7 +605,11 @@ fn stopped_node_resets_evidence() {
             .output()
             .unwrap()
     };
-    assert_eq!(reset(&[]).status.code(), Some(2), "says what to reset");
+    assert_eq!(
+        reset(&[]).status.code(),
+        Some(2),
+        "names the values for the reset"
+    );
     let cell = |name: &str| NodeName::new(name).unwrap();
     let running = StateFile::lock(directory.path(), &cell("lot"), &cell("edge")).unwrap();
     let refused = reset(&["--reputations"]);

@@ -74,7 +74,11 @@ fn example_vehicles_fit_example_edge() {
                 .of("car")
                 .is_some()
         );
-        assert_eq!(vehicle.landmarks, [], "a node's own file shares nothing");
+        assert_eq!(
+            vehicle.landmarks,
+            [],
+            "a node's own file contains no shared settings"
+        );
         assert!(
             vehicle.broker_listen().ip().is_unspecified(),
             "the others reach its broker"

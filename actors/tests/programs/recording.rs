@@ -193,7 +193,7 @@ async fn observer_records_all_messages() {
             .unwrap();
         let name = format!("edge--recorder-{}", observer.id());
         let mut observer = disk::Process(observer);
-        cell.until("the observer takes part", |cell| {
+        cell.until("the observer is a member", |cell| {
             cell.node("edge")
                 .members()
                 .borrow()

@@ -121,7 +121,7 @@ fn watchdog_needs_rounds() {
     assert_eq!(
         edge.hears("READY=1").len(),
         1,
-        "nothing is told before the node runs"
+        "the first notification comes when the node runs"
     );
     edge.hears("STATUS=leading");
     edge.hears("WATCHDOG=1");

@@ -166,7 +166,7 @@ fn two_cameras_make_one_map() {
     };
     assert!(
         std::iter::from_fn(next_line).any(|line| told(&line)),
-        "progress is told of"
+        "progress is printed"
     );
     for (label, page) in [("cat", &page), ("person", &second)] {
         assert!(

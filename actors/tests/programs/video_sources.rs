@@ -354,7 +354,7 @@ fn silent_network_camera_times_out() {
     });
     let asked = Instant::now();
     let error = source(&format!("kind = 'url'\nurl = '{url}'")).open(Duration::from_millis(300));
-    let error = error.err().expect("nothing comes").to_string();
+    let error = error.err().expect("no frame arrives").to_string();
     assert!(
         asked.elapsed() < Duration::from_secs(30),
         "it has a limit of its own"
@@ -480,7 +480,7 @@ fn killed_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGKILL);
-    until("the node tells of it", || {
+    until("the node reports it", || {
         log(directory.path()).contains("ecod-video ended, signal: 9 (SIGKILL)")
     });
     until("frames come again", || {
@@ -494,7 +494,7 @@ fn hanging_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGSTOP);
-    until("the node tells of it", || {
+    until("the node reports it", || {
         log(directory.path()).contains("no frame for")
     });
     until("frames come again", || {

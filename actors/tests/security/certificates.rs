@@ -202,7 +202,7 @@ async fn revoked_client_is_disconnected() {
         .unwrap();
 }
 
-/// A vehicle that cannot lead cannot pose as a broker: other vehicles do not trust it.
+/// A vehicle that cannot lead cannot pose as a broker: other nodes reject its certificate.
 #[tokio::test]
 async fn vehicle_certificate_makes_no_broker() {
     let mut cell = Cell::start().await;

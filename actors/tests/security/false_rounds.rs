@@ -154,7 +154,7 @@ async fn forged_standby_rounds_are_refused() {
         for (node, which) in [(&gauss, "the vehicle"), (&euclid, "the standby")] {
             assert!(
                 !is_deceived(node),
-                "{which} takes what a stranger says in the leader's name"
+                "{which} accepts a stranger's message in the leader's name"
             );
         }
         sleep(Duration::from_millis(20)).await;

@@ -228,7 +228,7 @@ impl Cell {
         let received = async {
             tokio::select! {
                 error = &mut flush => panic!("the vehicle lost its broker: {error}"),
-                received = timeout(SOON, self.edge.message()) => received.expect("nothing came").unwrap(),
+                received = timeout(SOON, self.edge.message()) => received.expect("no message arrived").unwrap(),
             }
         };
         assert_eq!(

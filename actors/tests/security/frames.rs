@@ -26,8 +26,8 @@ fn received_by(node: &Member) -> Vec<u8> {
     payloads.collect()
 }
 
-/// Relays between two nodes and sends every datagram for the first node three times; the second node has only this
-/// address for the first.
+/// Relays between two nodes and sends every datagram for the first node three times; the second node has only the
+/// relay's address.
 async fn repeat(towards: SocketAddr, relay: UdpSocket) {
     let behind = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     let mut there = [0; 2048];

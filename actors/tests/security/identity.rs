@@ -71,7 +71,7 @@ async fn nodes_meet_only_with_certificates() {
     assert_eq!(
         seen_by(&edge),
         [("euclid".to_owned(), Role::Auto)],
-        "as its certificate says"
+        "as in its certificate"
     );
     assert_eq!(seen_by(&euclid), [("edge".to_owned(), Role::Edge)]);
     assert!(seen_by(&bare).is_empty() && seen_by(&strange).is_empty());

@@ -179,9 +179,12 @@ async fn sole_leader_reports_refused_logins() {
     let edge = full_edge(&mut pki).await;
     let gauss = pki.issue("gauss", Role::Cav, DAY);
     let gauss = start("gauss", Role::Cav, gauss, edge.gossip_address()).await;
-    until("edge knows it", || edge.leadership().borrow().is_deserted).await;
+    until("the edge has the report", || {
+        edge.leadership().borrow().is_deserted
+    })
+    .await;
     gauss.stop().await;
-    until("nobody is left to complain", || {
+    until("no node reports a trouble", || {
         !edge.leadership().borrow().is_deserted
     })
     .await;

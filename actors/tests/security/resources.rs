@@ -147,7 +147,7 @@ impl Honest {
         self.vehicle.write_all(&report("v01", 2000)).await.unwrap();
         timeout(SOON, read_messages(&mut self.leader, 1))
             .await
-            .expect("nothing came");
+            .expect("no message arrived");
         begun.elapsed()
     }
 }
@@ -404,7 +404,7 @@ async fn uncertified_slow_readers_lose_theirs() {
         vehicle.write_all(&report("v01", 2000)).await.unwrap();
         timeout(SOON, read_messages(&mut leader, 1))
             .await
-            .expect("nothing came");
+            .expect("no message arrived");
         sleep(Duration::from_millis(20)).await;
     }
     flood.abort();

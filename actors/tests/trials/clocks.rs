@@ -360,7 +360,7 @@ fn certified_node_waits_for_clock() {
             "edge" => record.source() == Some("edge"),
             vehicle => record.has_lately([vehicle]),
         };
-        cell.until("it takes part", takes_part);
+        cell.until("the node is a member", takes_part);
         let took = cell.first_ready(late, set_at).since(set_at);
         println!("{late}, with a certificate, was ready {took:?} after its clock was set");
         let end = cell.now() + OWN_LOSS;

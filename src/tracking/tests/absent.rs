@@ -94,7 +94,7 @@ fn sole_claim_is_denied() {
             println!("{honest} look, view stated {is_view_stated}: {published:.3}, {counts:?}");
             assert!(
                 published < bound,
-                "{published} beside {honest}, view stated {is_view_stated}"
+                "{published} with {honest} honest vehicles, view stated {is_view_stated}"
             );
             let (right, wrong) = counts[&name("claimant")];
             // Observations of two vehicles are rarely enough for a judgement.

@@ -137,7 +137,11 @@ fn person_out_of_sight_keeps_identity() {
         sure(round).iter().find(walking).map(|object| object.id)
     };
     let before = id(&seen(0..50, true));
-    assert_eq!(id(&seen(50..100, false)), None, "nobody is published there");
+    assert_eq!(
+        id(&seen(50..100, false)),
+        None,
+        "the hidden person is not published"
+    );
     let after = id(&seen(100..120, true));
     assert!(before.is_some() && before == after, "{before:?} {after:?}");
 }

@@ -133,7 +133,7 @@ fn distant_glimpse_widens_no_view() {
     coverage.observe(&stated);
     assert!(
         coverage.range_m() < 30.0,
-        "a view without a pose says nothing of where it is"
+        "a view without a pose has no position"
     );
 }
 

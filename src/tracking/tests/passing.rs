@@ -38,7 +38,7 @@ fn passing_vehicle_counts_no_misses() {
     let [passed, alone] = [true, false].map(existence_of_a_car);
     assert!(
         (passed - alone).abs() < 0.001,
-        "existence is {passed} after twenty have passed, {alone} if nobody has"
+        "existence is {passed} after twenty vehicles have passed, {alone} without passing vehicles"
     );
 }
 
@@ -91,7 +91,7 @@ fn faulty_vehicle_is_no_second_witness() {
     let [with_liar, without] = [true, false].map(existence_of_a_ghost);
     assert!(
         with_liar < without + 0.02,
-        "{with_liar} with a liar beside, {without} without"
+        "{with_liar} with a malicious vehicle, {without} without"
     );
 }
 

@@ -26,7 +26,7 @@ fn fabricating_or_hiding_costs_trust() {
         .iter()
         .filter(|object| (object.y_m - 25.0).abs() < 3.0)
         .count();
-    assert_eq!(invented, 0, "nobody believes a liar");
+    assert_eq!(invented, 0, "invented objects are not published");
 }
 
 #[test]
@@ -121,7 +121,7 @@ fn distrust_survives_silence() {
     let mut round = tracker.close(at(400));
     assert!(
         round.objects.is_empty() && tracker.sensors.iter().next().is_none(),
-        "all are forgotten"
+        "all vehicles are removed"
     );
     let strangers =
         (0..2 * DormantCounts::MAX).map(|n| (name(&format!("z{n}")), TrustCounts::default()));
@@ -256,6 +256,6 @@ fn clutter_barely_affects_other_objects() {
     let beside = least_existence(300);
     assert!(
         without > 0.5 && beside > without - 0.1,
-        "{without:.2} without, {beside:.2} beside 300 invented ones a frame"
+        "{without:.2} without, {beside:.2} with 300 invented objects a frame"
     );
 }

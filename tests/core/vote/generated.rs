@@ -232,7 +232,7 @@ fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
 
 #[test]
 fn ninth_of_sets_matches_known_deficits() {
-    // Each balance is combined with each habit about once in 56 sets; every ninth set combines all balances and habits.
+    // Each balance is combined with each habit in about one of 56 sets, so a ninth of the sets covers all of them.
     let numbers: Vec<u64> = (1..SETS).step_by(9).collect();
     let unknown: Vec<_> = short_of(&numbers, 600)
         .into_iter()

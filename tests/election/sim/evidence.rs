@@ -177,7 +177,7 @@ impl World {
         let lacks = told.beyond(&node.ledger);
         assert!(
             lacks.0.is_empty() && lacks.1.is_empty(),
-            "{} was told {lacks:?} and does not know it",
+            "{} received {lacks:?} and does not have it",
             node.name
         );
     }
@@ -252,13 +252,13 @@ impl World {
         for (_, node) in self.alive() {
             if let Some(entry) = node.ledger.entries().find(|entry| !self.votes.hold(entry)) {
                 return Err(format!(
-                    "{} counts votes that nobody settled: {entry:?}",
+                    "{} counts votes that were not settled: {entry:?}",
                     node.name
                 ));
             }
             if let Some(mark) = node.ledger.marks().find(|mark| !self.votes.passed(mark)) {
                 return Err(format!(
-                    "{} has a mark that nobody reached: {mark:?}",
+                    "{} has a mark that was not reached: {mark:?}",
                     node.name
                 ));
             }

@@ -114,7 +114,7 @@ fn vouched_hung_leader_is_replaced() {
                 world.run_for(20 * MS);
                 ensure(
                     world.now - hung_at <= SECOND,
-                    "nobody has taken over after a second",
+                    "no node has taken over after a second",
                 )?;
             }
             Ok(())

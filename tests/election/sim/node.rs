@@ -160,7 +160,7 @@ pub(crate) struct Node {
     pub(crate) persisted: u64,
     /// Difference between the node's clock, which may be set, and the time of the simulation, in µs.
     pub(crate) clock: i64,
-    /// The start time on a steady clock, which dates the rounds of the process.
+    /// This difference at the start of the process. Its rounds are dated by a steady clock, which cannot be set.
     pub(crate) steady_clock: i64,
     pub(crate) armed: u64,
     pub(crate) paused_until: u64,

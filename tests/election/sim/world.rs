@@ -461,7 +461,7 @@ impl World {
                 );
                 assert!(
                     self.nodes[index].leadership.is_leading(),
-                    "leads before it is told"
+                    "leads before the machine reports it"
                 );
                 let owner = self
                     .owners

@@ -146,7 +146,10 @@ fn second_process_of_name_exits() {
     record.misses_and_repeats_none_after(before, "edge");
     let epochs = record.epochs_from(before, "edge");
     assert_eq!(epochs.len(), 1, "{epochs:?}");
-    eprintln!("longest gap beside a namesake {:?}", record.longest_gap());
+    eprintln!(
+        "longest gap with a second node of the name {:?}",
+        record.longest_gap()
+    );
     assert!(
         record.longest_gap() < Duration::from_secs(1),
         "{:?}",

@@ -88,7 +88,9 @@ async fn hear(socket: &mut Socket, wanted: &[u8]) -> Vec<u8> {
             );
         }
     };
-    timeout(PATIENCE, hearing).await.expect("not heard");
+    timeout(PATIENCE, hearing)
+        .await
+        .expect("no message arrived");
     heard
 }
 

@@ -114,7 +114,7 @@ async fn user_and_password_are_presented() {
         assert_eq!(
             intruder.counters.events(Event::BrokerRefused),
             1,
-            "told of once, not with every attempt"
+            "reported once, not with every attempt"
         );
     }
 }
@@ -146,11 +146,11 @@ async fn silent_publish_refusal_is_reported() {
             &[&denied.address()],
         )
         .await;
-        until("told of the refusal", || {
+        until("the refusal is reported", || {
             euclid.counters.events(Event::BrokerRefused) == 1
         })
         .await;
-        until("gauss hears itself", || {
+        until("gauss receives its own message", || {
             gauss.counters.events(Event::Echo) > 0
         })
         .await;
@@ -167,7 +167,7 @@ async fn stall_accuses_no_broker() {
     };
     let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
     std::thread::sleep(Duration::from_millis(300));
-    until("euclid hears itself", || {
+    until("euclid receives its own message", || {
         euclid.counters.events(Event::Echo) > 0
     })
     .await;

@@ -99,7 +99,7 @@ async fn neighbours_nearby_objects_are_mapped() {
         let hz = (subscriber.maps("south").len() - begun) as f64
             / clock::now().since(since).as_secs_f64();
         eprintln!(
-            "{}: {hz:.1} maps a second beside a neighbour, age there {:.0} ms",
+            "{}: {hz:.1} maps a second with a neighbour, age there {:.0} ms",
             broker.name(),
             1e3 * near.age_s
         );

@@ -46,7 +46,7 @@ async fn wrong_credentials_are_reported() {
 
         let node = start(right).await;
         // The own maps and status.
-        until("what it tells comes back", async || {
+        until("its own message comes back", async || {
             node.counters().events(Event::RegionReceived) > 3
         })
         .await;
@@ -186,7 +186,7 @@ async fn both_certificates_are_checked() {
 
     config.uplink.ca = Some(region.0);
     let node = start(config).await;
-    until("what it tells comes back", async || {
+    until("its own message comes back", async || {
         node.counters().events(Event::RegionReceived) > 3
     })
     .await;

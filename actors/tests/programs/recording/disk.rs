@@ -130,7 +130,7 @@ fn full_disk_costs_entries_only() {
         log.messages
             .iter()
             .any(|message| is(&message, "\"continue\"")),
-        "the second file says where it begins"
+        "the second file states its beginning"
     );
     assert!(
         log.messages

@@ -60,7 +60,7 @@ async fn viewers_receive_recorded_channels() {
         while !served() {
             assert!(
                 std::time::Instant::now() < deadline,
-                "the port is free and nobody serves there"
+                "the port is free without a server"
             );
             std::thread::sleep(Duration::from_millis(100));
         }

@@ -586,7 +586,7 @@ fn unsupported_map_is_false() {
             r#""v01""#,
             r#"{"contributors":["zeno"]}"#
         ),
-        "of nobody in the cell"
+        "not of a member of the cell"
     );
     assert!(
         !serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#)

@@ -316,7 +316,7 @@ impl Cell {
         }
         assert!(
             !readiness(self.nodes[name].page).0,
-            "{name} is ready and says {reason}"
+            "{name} is ready and reports {reason}"
         );
     }
 

@@ -161,7 +161,7 @@ impl Cell {
         self.settle_within(START_TIMEOUT).await
     }
 
-    /// The same condition, for at most this time.
+    /// Waits like [`Self::settle`], for at most this time.
     pub(crate) async fn settle_within(&mut self, limit: Duration) -> anyhow::Result<()> {
         let started = Instant::now();
         let mut well_since: Option<Instant> = None;
@@ -193,7 +193,7 @@ impl Cell {
             while logs::at_door(&node.door_log())?.is_empty() {
                 ensure!(
                     started.elapsed() < START_TIMEOUT,
-                    "the client beside {} gets no map",
+                    "the client at {} receives no map",
                     node.name
                 );
                 tokio::time::sleep(Duration::from_millis(50)).await;
@@ -537,6 +537,6 @@ impl Node {
 
     fn last_words(&self) -> String {
         let text = fs::read_to_string(self.log()).unwrap_or_default();
-        text.lines().last().unwrap_or("nothing logged").to_owned()
+        text.lines().last().unwrap_or("no log").to_owned()
     }
 }

@@ -222,7 +222,7 @@ mod tests {
             1,
             "refused by the node"
         );
-        assert_eq!(judge(&node, run([])).wrong, 1, "nothing at all");
+        assert_eq!(judge(&node, run([])).wrong, 1, "no maps");
     }
 
     #[test]

@@ -490,7 +490,7 @@ mod tests {
         assert!(!misses(&[void.clone(), right.clone(), slow]).is_empty());
         assert!(
             !misses(std::slice::from_ref(&void)).is_empty(),
-            "nothing was measured"
+            "no measurement"
         );
         let superseded = Verdict {
             stale_accepted: 1,

@@ -33,7 +33,7 @@ const MINUTE: Duration = Duration::from_secs(60);
 const MAX_AGE: Duration = Duration::from_secs(1);
 
 #[test]
-#[ignore = "takes as many minutes as it is told to: make soak"]
+#[ignore = "takes the given number of minutes: make soak"]
 fn soak() {
     end_with_the_harness(run());
 }
