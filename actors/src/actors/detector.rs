@@ -7,7 +7,7 @@
 //! ```
 //!
 //! The pump takes the latest frame only when the detector is done with the previous one, so frames
-//! never queue.
+//! do not queue.
 
 use std::pin::pin;
 use std::sync::Arc;

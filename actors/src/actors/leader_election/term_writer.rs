@@ -58,7 +58,7 @@ pub fn saved_term(file: Option<&StateFile>) -> u64 {
 
 impl TermWriter {
     /// Creates a writer. After it is dropped, it ends once the last term is on disk. Without a file
-    /// it does nothing.
+    /// its calls have no effect.
     pub(super) fn new(file: Option<StateFile>) -> Self {
         let (wanted, terms) = watch::channel(0);
         let (answers, answer) = watch::channel(DiskAnswer::default());

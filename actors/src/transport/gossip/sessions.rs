@@ -232,7 +232,7 @@ impl Sessions {
         may_send
     }
 
-    /// Ends the session of an earlier run of a node; returns false if there is none. For a node
+    /// Ends the session of an earlier run of a node; returns false without such a session. For a node
     /// that proves its certificate, only its own handshake can do so.
     pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         !self.prove_certificates() && self.peers.end_earlier_run(name, run, now)
