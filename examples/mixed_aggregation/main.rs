@@ -5,8 +5,8 @@
 //! All nodes run in this process, each on a separate runtime with a separate broker and sockets on loopback. Shutting a
 //! runtime down ends a node like SIGKILL ends a process: its connections break without a farewell. The vehicles have no
 //! cameras; their detections are published through their gateways ten times a second. Figures are from the maps that
-//! the nodes accepted, by their map logs. The program fails unless one leader serves the cell after every step, and if
-//! a node accepts a superseded map.
+//! the nodes accepted, by their map logs. The program fails if a step ends without one leader that serves the cell, or
+//! if a node accepts a superseded map.
 
 mod cell;
 

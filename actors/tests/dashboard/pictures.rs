@@ -75,7 +75,7 @@ async fn every_node_page_shows_cell() {
     cav.stop().await;
 }
 
-/// The edge and a plain client cannot receive more messages from the broker that ended with the edge.
+/// The broker that ended with the edge cannot report the departure of the edge and of a plain client.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn dead_brokers_clients_are_removed() {
     let directory = tempfile::tempdir().unwrap();
