@@ -1,4 +1,5 @@
-//! A detector of one's own in a node: red balls by their colour, from pixels to the cell's map.
+//! A custom detector in a node: it detects red balls by colour, and the program follows them from pixels to the cell's
+//! map.
 //!
 //! `cargo run --example custom_detector -- [DIRECTORY_OF_IMAGES]`
 //!
@@ -23,7 +24,7 @@ use opencv::{imgcodecs, imgproc};
 const BALL_M: f64 = 0.1;
 const LEAST_AREA_PX: f64 = 100.0;
 
-/// Takes every red blob for a ball.
+/// Detects every red blob as a ball.
 struct RedBalls;
 
 impl Detect for RedBalls {
@@ -39,7 +40,7 @@ fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
     let mut hsv = Mat::default();
     let mut mask = Mat::default();
     imgproc::cvt_color_def(image, &mut hsv, imgproc::COLOR_BGR2HSV)?;
-    // OpenCV's hue of red is around 0.
+    // OpenCV's hue of red is near 0.
     core::in_range(
         &hsv,
         &Scalar::new(0.0, 150.0, 80.0, 0.0),
@@ -58,7 +59,7 @@ fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
         let bounds = imgproc::bounding_rect(&outline)?;
         let width = f64::from(bounds.width);
         let height = f64::from(bounds.height);
-        // A disc fills π/4 of its box; the less a blob resembles one, the less sure it is.
+        // A disc fills π/4 of its box. The confidence falls with the difference from this share.
         let fill = imgproc::contour_area_def(&outline)? / (width * height);
         let confidence = 1.0 - (fill / std::f64::consts::FRAC_PI_4 - 1.0).abs();
         if width * height >= LEAST_AREA_PX && confidence > 0.5 {
@@ -147,7 +148,7 @@ async fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// One frame of a ball straight ahead, as the default optics show it.
+/// A frame with a ball straight ahead, drawn as the default optics project it.
 fn draw(directory: &Path) -> anyhow::Result<PathBuf> {
     let camera = OpticsConfig::default().lens()?.intrinsics;
     let grey = Scalar::new(120.0, 120.0, 120.0, 0.0);

@@ -1,4 +1,4 @@
-//! A town of 3 × 3 cells in generated traffic, beside one aggregator over everything.
+//! A town of 3 × 3 cells in generated traffic, compared with a single aggregator for the whole town.
 //!
 //! `make eval-city`, or `cargo run --release --example eval_city -- [--seeds N] [--seconds S] [--roads N] [--write-table FILE]`
 
@@ -113,7 +113,7 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// Writes the table between its marks in a document.
+/// Writes the table between its markers in a document.
 fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
     const MARKS: [&str; 2] = [
         "<!-- make eval-city -->\n",

@@ -1,21 +1,22 @@
-//! Accuracy of VOTE on label sets, measured on the program: one landmark per item, one vehicle per annotator, no
+//! Accuracy of VOTE on label sets, measured with the program: one landmark per item, one vehicle per annotator, without
 //! geometry.
 //!
 //! `make eval-labels`, or `cargo run --example eval_labels -- --program target/release/ecod-node [--sets DIR]
 //! [--config FILE] [--passes N] [--seed S] [--keep FRACTION] [--work DIR] [--write-table FILE]`
 //!
-//! DIR holds a folder for each set, or is one: `label.csv` with the columns `item,worker,label` and, if there are any,
-//! `confidence` (0 to 1, otherwise 1), and `truth.csv` with `item,truth`. Each set is written as a recording, run
-//! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-lab eval`, which lies beside
-//! `ecod-node`. All files stay in the work folder.
+//! DIR contains a folder for each set, or is such a folder: `label.csv` with the columns `item,worker,label` and
+//! optionally `confidence` (0 to 1, default 1), and `truth.csv` with `item,truth`. Each set is written as a recording,
+//! processed by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by the `ecod-lab eval` in
+//! the folder of `ecod-node`. All files are kept in the work folder.
 //!
-//! A second table compares PACE, VOTE and the answer that both agree on, by default settings but for the bounds of memory:
-//! [`PLACES`] known locations hold one item after the other, and each annotator reports it for both. Ties fall to the
-//! label that sorts first, so each figure is the mean of two runs: labels in the set's order, and in reverse.
+//! A second table compares PACE, VOTE and the label on which both agree, with default settings except for the memory
+//! limits: the items are assigned to [`PLACES`] landmarks in turn, and each annotator reports every item for both
+//! algorithms. A tie is decided for the label that sorts first, so each figure is the mean of two runs: one with the
+//! labels in the set's order, one in reverse order.
 //!
-//! The recording is as from a drive: items one after the other in random order, all annotators of an item in random
-//! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
-//! on.
+//! A recording resembles a drive: the items follow one another in random order, and the annotators of an item report in
+//! random order within the round in which the item is in view. `--keep` drops labels at random, to measure how the
+//! accuracy depends on their number.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fmt::Write as _;
@@ -47,7 +48,7 @@ const HEADER: &str = "| set | majority | best known | `paper` | online, one pass
 const START_US: u64 = 1_700_000_000_000_000;
 const ROUND_US: u64 = 100_000;
 
-/// Known locations of the comparison; an item is forgotten before the next one comes to its place.
+/// Landmarks of the comparison. The votes on an item expire before the next item is assigned to its landmark.
 const PLACES: u64 = 50;
 const PLACE_DISTANCE_M: f64 = 10.0;
 
@@ -99,7 +100,7 @@ fn options() -> anyhow::Result<Options> {
     Ok(options)
 }
 
-/// Names that a report can carry for the names of a set: the same wherever possible, otherwise numbered.
+/// Maps the names of a set to names that are allowed in a report: unchanged if possible, otherwise numbered.
 struct Names {
     kind: &'static str,
     is_allowed: fn(&str) -> bool,
@@ -137,7 +138,7 @@ fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 
-/// The rows of a table, each with the values of the named columns; those after `required` may be absent.
+/// The rows of a table, each with the values of the named columns; columns after `required` may be absent.
 fn rows(path: &Path, columns: &[&str], required: usize) -> anyhow::Result<Vec<Vec<String>>> {
     let mut reader = csv::ReaderBuilder::new()
         .trim(csv::Trim::All)
@@ -237,7 +238,7 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
         .try_for_each(|order| place(&reports, &truth, work, order))
 }
 
-/// Writes a set for the comparison: its items at known locations, for both algorithms, labels named by their order.
+/// Writes a set for the comparison: its items at landmarks, for both algorithms, with labels named by their order.
 fn place(
     reports: &[Value],
     truth: &BTreeMap<String, String>,
@@ -265,7 +266,7 @@ fn place(
     for report in reports {
         let object = &report["objects"][0];
         let mut report = report.clone();
-        // An item without a known truth would be judged by that of the item before it.
+        // An item without truth would be judged by the truth of the item before it.
         let Some(true_label) = object["landmark"].as_str().and_then(|item| truth.get(item)) else {
             continue;
         };
@@ -297,7 +298,7 @@ fn place(
     Ok(())
 }
 
-/// Runs the program; of what it says, only rejections are shown.
+/// Runs the program and prints only the rejections in its output.
 fn run(command: &mut Command) -> anyhow::Result<()> {
     let output = command
         .stdin(Stdio::null())
@@ -339,7 +340,7 @@ fn measure(
     Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))
 }
 
-/// Accuracy in percent of PACE, of VOTE, and of the map where both run.
+/// Accuracy in percent of PACE, of VOTE, and of the map with both algorithms.
 fn compare(options: &Options, work: &Path) -> anyhow::Result<[f64; 3]> {
     let accuracy = |algorithms: &str, judged: &str| -> anyhow::Result<f64> {
         let config = placed_config(options, algorithms)?;
@@ -452,7 +453,7 @@ fn paper_config(options: &Options) -> anyhow::Result<PathBuf> {
     Ok(path)
 }
 
-/// The folders of the sets, known ones first.
+/// The folders of the sets; the sets with published accuracies come first.
 fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let is_set = |path: &PathBuf| path.join("label.csv").is_file();
     if is_set(&folder.to_owned()) {

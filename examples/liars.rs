@@ -1,14 +1,16 @@
-//! Effect of liars on verdicts: ⌊(n−1)/2⌋ of n vehicles lie, in four ways, by rejoining under new names, and by forged evidence.
+//! Effect of malicious vehicles on verdicts: ⌊(n−1)/2⌋ of n vehicles make false statements, in four ways, by rejoining
+//! under new names, and by forged evidence.
 //!
 //! `cargo run --release --example liars -- [--svg FILE] [--table FILE] [--write-table FILE] [--seeds N]`
 //!
-//! `--write-table` puts the rows of three sizes between the markers of the table in a text.
+//! `--write-table` writes the rows of three sizes between the markers of the table in a document.
 //!
-//! Fails, and names the row, if the worst seed has less than 90 % right verdicts, if verdicts are less often right than the
-//! majority of honest vehicles alone, or if forged evidence is taken.
+//! Fails, and names the row, if the worst seed has less than 90 % right verdicts, if verdicts are less often right than
+//! the majority of honest vehicles alone, or if forged evidence is accepted.
 //!
-//! Honest vehicles are right 80 % of the time, independently. Figures are over the rounds from 300 to 600 and all seeds,
-//! 100 rounds after the last liar has begun to lie; `worst` is the worst seed. The drawing shows the mean of all seeds.
+//! Honest vehicles are right 80 % of the time, independently. Figures cover the rounds from 300 to 600 and all seeds,
+//! and start 100 rounds after the last malicious vehicle has become active; `worst` is the worst seed. The drawing
+//! shows the mean of all seeds.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -50,13 +52,13 @@ const LIES: [Lie; 6] = [
     Lie::Rejoining,
     Lie::Forging,
 ];
-/// Round before which the aggregator restarts, where evidence is forged.
+/// Round before which the aggregator restarts, in runs with forged evidence.
 const RESTART: u64 = 150;
 /// Rounds of 12 s in which another candidate follows the forger. A leader renews its term after 10 s at most.
 const MISLED: Range<u64> = 102..114;
-/// These and the 5 s in which the last word of a leader is taken.
+/// These rounds and the 5 s in which the last message of a former leader is accepted.
 const MISLED_WITH_LAST_WORD: Range<u64> = MISLED.start..MISLED.end + 10;
-/// Least percent of right verdicts of a row's worst seed.
+/// Minimum percentage of right verdicts for a row's worst seed.
 const MIN_WORST: f64 = 90.0;
 const HONEST_ACCURACY: f64 = 0.8;
 const PERIOD: Duration = Duration::from_millis(500);
@@ -67,17 +69,18 @@ enum Lie {
     Random,
     /// Always the same label.
     Constant,
-    /// All liars the same wrong label.
+    /// All malicious vehicles state one wrong label.
     Copying,
     /// Honest for a third of the time, then copying.
     Turning,
     /// Copying, under a new name every ten rounds.
     Rejoining,
-    /// Copying; the first is a candidate that tells the others every round that liars are right and others wrong.
+    /// Copying; the first malicious vehicle is a candidate that publishes every round that malicious vehicles are right
+    /// and others wrong.
     Forging,
 }
 
-/// A candidate in a cell with certificates. Signatures are taken as verified.
+/// A candidate in a cell with certificates. The signatures are assumed to be verified.
 struct Candidate {
     resync: LedgerResync,
     ledger: ReputationLedger,
@@ -107,7 +110,7 @@ impl Candidate {
         Ok(())
     }
 
-    /// Takes what another candidate says.
+    /// Processes a share of another candidate.
     fn take(&mut self, share: &LedgerShare, now: Timestamp) -> Result<Merged, Box<dyn Error>> {
         let candidates = std::slice::from_ref(&share.node);
         Ok(self.resync.merge(
@@ -121,11 +124,11 @@ impl Candidate {
     }
 }
 
-/// The candidates beside the liars: the aggregator, and one that has led before.
+/// The honest candidates: the aggregator, and a candidate that has led before.
 struct Cell {
     edge: Candidate,
     euclid: Candidate,
-    /// Shares of `euclid` on their way.
+    /// Shares of `euclid` in transit.
     passed_on: Vec<LedgerShare>,
 }
 
@@ -144,7 +147,7 @@ impl Cell {
         })
     }
 
-    /// Counts what a round settled, and tells the other candidate.
+    /// Counts the evidence of a round, and sends it to the other candidate.
     fn record(&mut self, evidence: &[Evidence], now: Timestamp) -> Result<(), Box<dyn Error>> {
         let Some(epoch) = &self.edge.leadership.epoch else {
             return Ok(());
@@ -160,8 +163,8 @@ impl Cell {
         Ok(())
     }
 
-    /// The first liar tells both candidates of leaderships of its own. One starts, and follows it until the aggregator
-    /// renews its term. Fails if the aggregator takes anything.
+    /// The first malicious vehicle announces leaderships of its own to both candidates. One candidate starts, and
+    /// follows it until the aggregator renews its term. Fails if the aggregator accepts any evidence.
     fn forge(
         &mut self,
         round: u64,
@@ -216,7 +219,7 @@ fn signed(share: LedgerShare) -> LedgerShare {
     }
 }
 
-/// Evidence of a leadership of the first liar: all liars are right and all others wrong.
+/// Evidence of a leadership of the first malicious vehicle: all malicious vehicles are right and all others wrong.
 fn forged(term: u64, vehicles: usize, liars: usize) -> Result<LedgerShare, Box<dyn Error>> {
     let forger = NodeName::new("liar-0")?;
     let entry = |vehicle: usize, label: &str| {
@@ -258,11 +261,12 @@ fn forged(term: u64, vehicles: usize, liars: usize) -> Result<LedgerShare, Box<d
 }
 
 struct Course {
-    /// Share of right verdicts and of right majorities of all vehicles of each ten rounds.
+    /// Share of right verdicts, and of right majorities of all vehicles, for each ten rounds.
     accuracy: Vec<(f64, f64)>,
-    /// Mean reputation of the honest and of the liars at the end of each ten rounds.
+    /// Mean reputation of the honest and of the malicious vehicles at the end of each ten rounds.
     reputation: Vec<(f64, f64)>,
-    /// Percent of right verdicts once settled, of all votes' majorities, and of the honest votes' majorities.
+    /// Percentages after the start phase: right verdicts, right majorities of all votes, and right majorities of the
+    /// honest votes.
     settled: f64,
     majority: f64,
     honest: f64,
@@ -291,7 +295,7 @@ impl Trial {
         }
     }
 
-    /// Title of its panel.
+    /// Title of the panel.
     fn name(&self) -> String {
         format!(
             "{}, {} of {} lie",
@@ -308,7 +312,7 @@ impl Trial {
             .fold(f64::INFINITY, f64::min)
     }
 
-    /// The flaw, if liars achieve more than the bound allows.
+    /// The violation, if malicious vehicles have more effect than the bound allows.
     fn flaw(&self) -> Option<String> {
         let worst = self.worst();
         let verdicts = self.mean(|c| c.settled);
@@ -385,7 +389,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
                 vote.adopt(&cell.edge.ledger);
             }
         }
-        // The objects are exchanged when the votes of the last ones are no longer fresh.
+        // The objects are exchanged when the votes on the last objects are stale.
         if round % 6 == 0 {
             now = now + Duration::from_secs(3);
             truths
@@ -480,7 +484,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     Ok(course)
 }
 
-/// One column a number of vehicles, one row a lie.
+/// A column for each number of vehicles, a row for each attack.
 fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
     let columns = SIZES.len();
     let area = SVGBackend::new(path, (320 * columns as u32, 1200)).into_drawing_area();

@@ -26,7 +26,7 @@ async fn main() -> anyhow::Result<()> {
     let (client, mut events) = AsyncClient::new(options, 10);
     loop {
         match events.poll().await? {
-            // A broker forgets subscriptions with the connection: subscribe whenever there is a new one.
+            // A broker drops subscriptions with the connection, so subscribe after every connect.
             Event::Incoming(Packet::ConnAck(_)) => client.try_subscribe(&topic, QoS::AtMostOnce)?,
             Event::Incoming(Packet::Publish(packet)) => {
                 match decode::<GlobalMap>(&packet.payload, &Limits::default()) {

@@ -1,4 +1,4 @@
-//! Fuses three vehicles' reports in memory: no clock, no socket, no broker.
+//! Fuses the reports of three vehicles in memory, without clock, socket and broker.
 //!
 //! `cargo run --example three_reports`
 
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         start,
     );
 
-    // Two see slot-0 and agree, one reads slot-1, nobody finds anything at slot-2.
+    // Two vehicles read slot-0 and agree, one reads slot-1, and slot-2 is empty for all.
     for frame in 0..4 {
         let now = start.shifted(100_000 * (frame + 1));
         for (node, object) in [

@@ -1,4 +1,4 @@
-"""Decodes messages of the example cpm_samples, checks what is known of them, and encodes them again to the same bytes."""
+"""Decodes messages of the example cpm_samples, checks their known values, and encodes them again to the same bytes."""
 
 import pathlib
 import re
@@ -15,7 +15,7 @@ INSIDE = {
 
 
 def modules(folder):
-    """The modules of a CPM. asn1tools reads neither successors nor inner constraints, which UPER does not show either."""
+    """The modules of a CPM without successors and inner constraints: asn1tools cannot read them, and UPER does not encode them."""
     texts = [path.read_text(errors="replace") for path in sorted(pathlib.Path(folder).rglob("*.asn"))]
     wanted = [text for text in texts if re.search(r"^CPM-|^ETSI-ITS-CDD *\{.*major-version-[34]", text, re.M)]
     for text in wanted:

@@ -174,7 +174,7 @@ class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
     transforms: sequence[TransformStamped]
 
 
-# As nodes of ROS have it unless told otherwise.
+# The default of ROS nodes.
 DEFAULT = Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.KeepLast(10))
 
 NO_TURN = Quaternion(0.0, 0.0, 0.0, 1.0)

@@ -24,7 +24,7 @@ TOLERANCE = 1e-6
 
 
 def read(truth_path, maps_path):
-    """Frames of (true objects, objects said): the nearest map, and the truth at its time."""
+    """Frames of (true objects, published objects): the nearest map, and the truth at its time."""
     truth = json.load(open(truth_path))["frames"]
     maps = [json.loads(line) for line in open(maps_path) if line.strip()]
     times = np.array([m["fused_at_us"] for m in maps], dtype=np.int64)
@@ -56,7 +56,7 @@ def distance(true, said):
 
 
 def greedy(frames, limit):
-    """Score and hit of every object said, by label."""
+    """Score and hit of every published object, by label."""
     hits = defaultdict(list)
     for here, said in frames:
         taken = set()

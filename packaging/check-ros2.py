@@ -1,5 +1,5 @@
-"""Reads logs of profile ros2 by mcap-ros2-support, has rosbags write each message again to the same bytes, and holds the definitions
-in the logs against those of ROS 2 Humble."""
+"""Reads logs of profile ros2 by mcap-ros2-support, has rosbags write each message again to equal bytes, and compares the definitions
+in the logs with the definitions of ROS 2 Humble."""
 
 import collections
 import sys
@@ -33,7 +33,7 @@ def read(path, counts):
                 assert car.bbox.center.position.x == 12.5 and car.bbox.center.position.y == -3.0
             if channel.topic == "/ecod/map/detections":
                 for found in decoded.detections:
-                    # Both know cars alone: the score is how certain the object is.
+                    # All reports state cars, so the score is the probability of the object.
                     (hypothesis,) = (result.hypothesis for result in found.results)
                     assert hypothesis.class_id == "car" and 0 < hypothesis.score < 0.999
             if channel.topic == "/tf":

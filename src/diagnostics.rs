@@ -64,7 +64,7 @@ const UNTIL_SETTLED: Duration = Duration::MAX;
 
 trouble_kinds! {
     /// The leader does not use this node's reports.
-    ReportsRefused = "reports_refused", SHORT, "do what the leader says";
+    ReportsRefused = "reports_refused", SHORT, "follow the remedy that the leader states";
     /// Reports whose times cannot be used.
     Untimely = "untimely", SHORT, "run a time service where its reports are made, such as chrony";
     /// A clock differs from the cell's time by seconds.

@@ -62,8 +62,8 @@ const MAX_OBJECTS_EACH: usize = 128;
 /// is used.
 const MAX_SCORES: usize = 8;
 
-/// Maximum time for which an object counts as seen, so that a cell cannot claim an identity by
-/// dating its objects far back.
+/// Longest accepted tracking time of an object. The bound stops a cell from claiming an identity
+/// with an early first-seen time.
 const MAX_SEEN_FOR: Duration = Duration::from_secs(600);
 
 /// Objects of accepted maps that were not used.

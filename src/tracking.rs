@@ -1,12 +1,13 @@
-//! Tracking of objects at no known location: each once, under one identity, across vehicles that move.
+//! Tracking of objects away from landmarks: a map contains each object once, with a constant identity, although the
+//! vehicles that detect it move.
 //!
-//! A [`Tracker`] takes admitted reports by [`Tracker::observe`] and closes rounds by [`Tracker::close`]. Within a round,
-//! reports count in the order of capture, whatever the order of arrival. `docs/tracks.md` has the equations.
+//! [`Tracker::observe`] adds an admitted report, and [`Tracker::close`] closes a round. A [`Tracker`] processes the
+//! reports of a round in the order of capture, independently of their order of arrival. `docs/tracks.md` has the
+//! equations.
 //!
-//! A vehicle needs no calibration beforehand. Its noise, field of view, detection rates, calibration and pose bias
-//! are estimated from what it has in common with the others. Maps of neighbouring cells lend
-//! identities; they spawn and keep no track. The last map of another aggregator of this cell spawns tracks whose existence
-//! fades.
+//! A vehicle needs no prior calibration. The tracker estimates its noise, field of view, detection rates, calibration
+//! and pose bias from objects that other vehicles detect too. Maps of neighbouring cells provide identities, but do not
+//! spawn or maintain tracks. The last map of another aggregator of this cell spawns tracks whose existence fades.
 
 mod assignment;
 mod calibration;
@@ -60,19 +61,19 @@ pub struct TracksRound {
     pub evidence: Vec<Evidence>,
 }
 
-/// Numbers of identities that tracks took over from neighbouring cells.
+/// Number of identities that tracks took over from neighbouring cells.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct HandOvers {
-    /// By new tracks.
+    /// Identities taken over by new tracks.
     pub begun: u64,
-    /// By tracks that had an identity of this cell.
+    /// Identities taken over by tracks that had an identity of this cell.
     pub renamed: u64,
 }
 
-/// Numbers of reports and objects that were not used.
+/// Number of reports and objects that were not used.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TracksLosses {
-    /// Reports that came later than [`TracksConfig::max_lag_s`].
+    /// Reports that arrived later than [`TracksConfig::max_lag_s`].
     pub late: u64,
     /// New objects beyond [`TracksConfig::max_tracks`] or [`TracksConfig::max_density`].
     pub refused: u64,

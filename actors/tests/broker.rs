@@ -1,6 +1,9 @@
 //! The embedded broker's life, alone in its process so that its threads can be counted.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test that cannot continue panics at that line"
+)]
 
 use std::net::{SocketAddr, TcpStream};
 

@@ -1,6 +1,10 @@
-//! More comes in than is taken: nobody pays for it but who sends it. Alone in its process, whose memory is measured.
+//! Messages arrive faster than they are processed: only their sender is affected. Alone in its process, whose memory is
+//! measured.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test that cannot continue panics at that line"
+)]
 
 use std::net::SocketAddr;
 use std::num::NonZero;
@@ -26,7 +30,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 /// Vehicles that all send too much.
 const VEHICLES: usize = 32;
 
-/// Times and memory are those of the whole process: one test at a time.
+/// Times and memory are measured for the whole process, so only one test runs at a time.
 static ALONE: Mutex<()> = Mutex::const_new(());
 
 /// An edge with its broker and two locations three metres apart.
@@ -152,7 +156,7 @@ async fn flood_delays_no_other_reports() {
     let flooded = sorted_times(&answers);
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
-    println!("median {quiet_median:?}, beside a flood {flooded_median:?}; {left_out} left out");
+    println!("median {quiet_median:?}, during a flood {flooded_median:?}; {left_out} left out");
     assert!(
         flooded_median < quiet_median + Duration::from_millis(50),
         "{quiet:?} {flooded:?}"
@@ -234,8 +238,8 @@ async fn tenfold_load_keeps_period() {
     edge.stop().await;
 }
 
-/// Threads that do nothing but sleep. A fair scheduler lets such a thread run within milliseconds of its waking, however
-/// busy the process is: what it waits for longer is a machine that stands still, as a virtual one does whose host is busy.
+/// Threads that only sleep. A fair scheduler runs such a thread within milliseconds of its waking, however busy the
+/// process is. A longer delay is a stall of the machine, for example of a virtual machine with a busy host.
 struct Sleepers {
     wanted: Arc<AtomicBool>,
     threads: Vec<thread::JoinHandle<Vec<Wait>>>,
@@ -286,7 +290,7 @@ impl Sleepers {
 }
 
 impl StoodStill {
-    /// The longest wait, less what a sleeper overslept during it.
+    /// The longest wait, less the time that a sleeper overslept during it.
     fn longest(&self, waits: &[Wait]) -> Duration {
         let overslept = |(from, until): &Wait| {
             self.0

@@ -1,8 +1,10 @@
-//! Ranging by the ground on WILDTRACK: the foot of each box by [`Projection`], beside the annotated place of a person.
+//! Ranging by the ground on WILDTRACK: compares the position of each box's foot, by [`Projection`], with the annotated
+//! position of a person.
 //!
-//! MVDeTr found the people, and its boxes are the rectangles of the annotation at the places that it found. So its errors
-//! count too. The rectangles show an upright card of 0.5 by 1.8 m in the middle of a person: their lower edge is below the
-//! middle and not at the near side. Therefore a card without depth is judged, and beside it a person of usual depth.
+//! MVDeTr detected the people, and its boxes are the annotation's rectangles at the detected positions, so the figures
+//! include its errors. Each rectangle shows an upright card of 0.5 by 1.8 m in the middle of a person: its lower edge
+//! is below the middle of the person, not at the near side. Therefore both a card without depth and a person of usual
+//! depth are evaluated.
 
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::perception::camera::Mount;
@@ -14,7 +16,7 @@ use nalgebra::Point2;
 use super::ground_camera::GroundCamera;
 use super::wildtrack::Wildtrack;
 
-/// Range in metres up to which places are judged.
+/// Range in metres up to which positions are judged.
 const MAX_RANGE_M: f64 = 20.0;
 const CARD: ObjectSize = ObjectSize {
     width_m: 0.0,
@@ -23,7 +25,7 @@ const CARD: ObjectSize = ObjectSize {
     relative_sigma: 0.02,
 };
 
-/// Prints a table of errors in metres, by camera and in all.
+/// Prints a table of errors in metres, by camera and in total.
 pub(super) fn print(data: &Wildtrack) {
     println!(
         "| WILDTRACK camera | height | pitch | boxes within 20 m | median | 90 % | median with usual depth |"
@@ -68,7 +70,8 @@ fn row(name: &str, [card, person]: &[Vec<f64>; 2]) {
     );
 }
 
-/// Distances of the camera's places from the nearest annotated ones; without a size, people have the usual one.
+/// Distances of the camera's positions from the nearest annotated positions; without a size, people have the default
+/// size.
 fn errors(
     camera: &GroundCamera,
     data: &Wildtrack,
@@ -93,7 +96,7 @@ fn errors(
         for [left, top, width, height, ..] in
             boxes.iter().filter(|cells| cells[5] as usize == number)
         {
-            // The middles of whole pixels.
+            // The centres of whole pixels.
             let x_min = left + 0.5;
             let y_min = top + 0.5;
             let bounding_box = BoundingBox {

@@ -15,7 +15,8 @@ pub(super) struct GroundCamera {
 }
 
 impl GroundCamera {
-    /// The camera of square pixels that maps the ground in centimetres so: H = K (r₁ r₂ t). `None` if there is none.
+    /// The camera of square pixels with this homography from the ground in centimetres: H = K (r₁ r₂ t). `None` if
+    /// there is no such camera.
     ///
     /// With u the vertical and s the sine of the axis over the horizon, M = h₁h₁ᵀ + h₂h₂ᵀ = K (I - u uᵀ) Kᵀ. Columns and rows
     /// as complex numbers leave a quadratic equation for K u, whose other root puts the principal point far off.

@@ -1,6 +1,6 @@
 //! KITTI tracking: the validation sequences of AB3DMOT with detections of PointRCNN.
 //!
-//! One vehicle reports in a frame that goes with it, as the recording has no pose there.
+//! One vehicle reports in its own moving frame, because the recording has no poses in a fixed frame.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,15 +17,15 @@ pub(super) const DETECTIONS: (&str, &str) = ("AB3DMOT/data/KITTI/detection", REP
 
 pub(super) const TRUTH: (&str, &str) = ("AB3DMOT/scripts/KITTI/label", REPOSITORY);
 
-/// The sequences on which PointRCNN was not trained, by `scripts/KITTI/evaluate_tracking.seqmap.val`. Parameters of tracks
-/// were fitted with the first six in view.
+/// The sequences on which PointRCNN was not trained, by `scripts/KITTI/evaluate_tracking.seqmap.val`. The first six
+/// sequences were used to fit parameters of tracks.
 pub(super) const SEQUENCES: [&str; 11] = [
     "0001", "0006", "0008", "0010", "0012", "0013", "0014", "0015", "0016", "0018", "0019",
 ];
 
 const FRAME_RATE: &str = "10";
 
-/// Number of sequences that were in view.
+/// Number of sequences that were used for the fit.
 pub(super) const FITTED: usize = 6;
 
 pub(super) fn convert(

@@ -1,10 +1,10 @@
-//! Accuracy on real recordings, measured on the programs: detections are replayed as reports, and judged by `eval`. Ranging
-//! by the ground is held against annotated places.
+//! Accuracy on real recordings, measured with the programs: detections are replayed as reports, and judged by `eval`.
+//! Positions from ranging by the ground are compared with annotated positions.
 //!
 //! `make eval-real DIR=…`, or `cargo run --example eval_real -- --program target/release/ecod-node --data DIR [--work DIR]`
 //!
-//! DIR holds copies of public repositories, named as they are there; `docs/evaluation.md` has the list. What is missing
-//! is named, and makes the program fail after all others were judged.
+//! DIR contains copies of public repositories under their original names; `docs/evaluation.md` has the list. The
+//! program names each missing copy, judges all others, and then fails.
 
 mod foot_points;
 mod ground_camera;
@@ -21,10 +21,10 @@ use ecod::wire::ObjectReport;
 use serde_json::Value;
 use wildtrack::Wildtrack;
 
-/// Labels are judged by the example `eval_labels`, which needs these.
+/// Labels are judged by the example `eval_labels`, which reads these files.
 const LABEL_SETS: [&str; 4] = ["CF", "CF_amt", "SP", "SP_amt"];
 
-/// Paths below DIR and the repository that has them.
+/// Paths below DIR and the repository that contains them.
 const LABELS: (&str, &str) = (
     "truth-inference-at-scale/data/active-crowd-toolkit",
     "yuan-li/truth-inference-at-scale",
@@ -53,7 +53,7 @@ const COLUMNS: [&str; 17] = [
 /// Configuration without correction of poses.
 const UNALIGNED: &str = "[fusion.tracks]\nalign = false\n";
 
-/// A recording: its truth, what others make of it, all in one form of file, and its reports.
+/// A recording: its truth, the results of other methods in the same file format, and its reports.
 struct Recording {
     name: &'static str,
     format: &'static str,
@@ -214,7 +214,7 @@ fn run(command: &mut Command) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints a row of the table. Identities are those of tracks only.
+/// Prints a row of the table. Only tracks have identities.
 fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
     let figure =
         |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));

@@ -1,8 +1,8 @@
-//! WILDTRACK (Chavdarova et al., CVPR 2018): seven cameras around a square, with boxes that ReST keeps of MVDeTr.
+//! WILDTRACK (Chavdarova et al., CVPR 2018): seven cameras around a square, with the MVDeTr boxes that ReST uses.
 //!
-//! The 40 frames of its test part, two a second. Each camera reports the feet of its boxes on the ground, and its own pose,
-//! at which it stands. MVDeTr finds people in all images together, so the cameras' errors are not independent. The truth of
-//! MVDet has no identities.
+//! The 40 frames of its test part, at two frames per second. Each camera reports the feet of its boxes on the ground,
+//! and its own fixed pose. MVDeTr detects people in all images together, so the errors of the cameras are not
+//! independent. The truth of MVDet has no identities.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -36,7 +36,7 @@ pub(super) const TRUTH: (&str, &str) = (
 
 const FRAME_RATE_HZ: f64 = 2.0;
 
-/// The truth counts frames of ten a second, on a grid of 2.5 cm from this corner in metres.
+/// The truth counts frames at ten per second, on a grid of 2.5 cm from this corner in metres.
 const TRUTH_FRAMES: u64 = 5;
 const GRID_M: f64 = 0.025;
 const CORNER_M: [f64; 2] = [-3.0, -9.0];
@@ -50,7 +50,7 @@ const FOOT_PIXELS: f64 = 5.0;
 /// Row of pixels at which the image cuts a box, so that its foot is not in view.
 const LAST_ROW: f64 = 1079.0;
 
-/// The boxes of a frame: left, top, width, height, nothing, camera.
+/// The boxes of a frame: left, top, width, height, an unused value, camera.
 type Boxes = BTreeMap<u64, Vec<[f64; 6]>>;
 
 /// Boxes, cameras and truth.
@@ -59,7 +59,7 @@ pub(super) struct Wildtrack {
     /// From the ground in centimetres to the image without distortion, by camera.
     homographies: Vec<Matrix3<f64>>,
     pub(super) cameras: Vec<GroundCamera>,
-    /// Places of people in metres by frame.
+    /// Positions of people in metres by frame.
     pub(super) positions: BTreeMap<u64, Vec<Point2<f64>>>,
 }
 

@@ -1,10 +1,11 @@
-//! Tracks in generated traffic, beside the best vehicle alone, all reports together, and late fusion.
+//! Tracks in generated traffic, compared with the best single vehicle, with all reports together, and with late fusion.
 //!
 //! `make eval-tracks`, or `cargo run --release --example eval_tracks -- [--seeds tuning|report] [--count N] [--seconds S]
 //! [--observers 2,4,8] [--write-table FILE] [--svg FILE] [--reliability FILE] [--recordings DIR]`
 //!
-//! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
-//! of them. `--reliability` draws how often ECOD's objects are right by what they state. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
+//! Parameters are chosen on the seeds `tuning`, and figures are reported on the seeds `report`; `--count` uses the
+//! first seeds only. `--reliability` draws how often ECOD's objects are right over the probability that they state.
+//! `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
 //! `ecod-lab eval`.
 
 mod plot;
@@ -38,10 +39,10 @@ use uuid::Uuid;
 const TUNING: Range<u64> = 1..5;
 const REPORT: Range<u64> = 1001..1005;
 const OBSERVERS: [usize; 7] = [1, 2, 4, 8, 16, 32, 50];
-/// Towns that the printed table and the drawing have, and the table of `--write-table` omits.
+/// Towns in the printed table and in the drawing; the table of `--write-table` omits them.
 const ONLY_DRAWN: [&str; 4] = ["2", "8", "16", "32"];
 
-/// Ways to make a map of the same reports.
+/// Methods that make a map from the same reports.
 pub(crate) const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
 
 /// Columns of the table.
@@ -63,7 +64,7 @@ pub(crate) const FIGURES: [&str; 12] = [
 /// Number of figures that are percentages; they come first.
 const PERCENTAGES: usize = 10;
 
-/// The figures of one method, in the order of [`FIGURES`]; NaN where there is none.
+/// The figures of one method, in the order of [`FIGURES`]; NaN for a figure that the method does not have.
 pub(crate) type Figures = [f64; FIGURES.len()];
 
 const USAGE: &str = "eval_tracks [--seeds tuning|report] [--count N] [--seconds S] [--observers 2,4,8] [--write-table FILE] \
@@ -138,7 +139,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// A town with every number of observers, a recording of two vehicles, and parked cars that many pass.
+    /// A town with every number of observers, a recording of two vehicles, and parked cars that many vehicles pass.
     fn all(options: &Options) -> Vec<Self> {
         let town = |&observers: &usize| Self {
             name: observers.to_string(),
@@ -171,7 +172,7 @@ impl Scene {
     }
 }
 
-/// All methods on one recording; `write` gets every map of late fusion.
+/// All methods on one recording; `write` receives every map of late fusion.
 fn run(
     recording: &TrafficRecording,
     observers: usize,
@@ -213,14 +214,14 @@ fn run(
 
 enum Event<'a> {
     Report(&'a ObjectReport),
-    /// It is time for the others to say what they make of the reports so far.
+    /// The other methods are due to output a map of the reports so far.
     Due(Timestamp),
 }
 
-/// Time between two answers of the others.
+/// Time between two outputs of the other methods.
 const PERIOD: Duration = Duration::from_millis(100);
 
-/// Maps that an aggregator makes of a recording; `watch` hears of every report as it comes and of the time.
+/// Maps that an aggregator makes of a recording; `watch` receives every report and the times at which maps are due.
 fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<GlobalMap> {
     let config = FusionConfig {
         algorithms: Algorithms::Pace,
@@ -252,7 +253,7 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
             *due = *due + PERIOD;
         }
         watch(Event::Report(&arrived.report));
-        // A rejected report is one that comes too late.
+        // The only reason for a rejection is a late report.
         take(
             aggregator
                 .report(
@@ -270,7 +271,7 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
     maps
 }
 
-/// One vehicle by itself, at the times of its captures: nothing takes time.
+/// A single vehicle, at the times of its captures, without any delay.
 fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluation) -> TrackScores {
     let mut tracker = NearestTracker::default();
     let mut own: Vec<_> = recording
@@ -323,7 +324,7 @@ fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
     ]
 }
 
-/// Where a recording is written to, line by line.
+/// Destination of a recording, written line by line.
 struct Files {
     maps: BufWriter<File>,
 }

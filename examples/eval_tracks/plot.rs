@@ -22,7 +22,7 @@ pub(crate) fn draw(
     path: &Path,
     courses: &[(usize, [Figures; METHODS.len()])],
 ) -> anyhow::Result<()> {
-    let last = courses.len().checked_sub(1).context("nothing to draw")?;
+    let last = courses.len().checked_sub(1).context("no figures to draw")?;
     let area = SVGBackend::new(path, (960, 640)).into_drawing_area();
     area.fill(&WHITE)?;
     let (legend, panels) = area.split_vertically(30);
@@ -46,7 +46,7 @@ pub(crate) fn draw(
             .x_label_area_size(34)
             .y_label_area_size(36)
             .build_cartesian_2d(-0.2..last as f64 + 0.2, lowest..100.0)?;
-        // Numbers of vehicles double from point to point, nearly: each has the same room.
+        // The numbers of vehicles nearly double from point to point, so the points have equal distances.
         let name = |x: &f64| {
             let is_point = (x - x.round()).abs() < 0.01;
             courses

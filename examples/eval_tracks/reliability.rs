@@ -1,4 +1,4 @@
-//! Reliability diagrams: the share of objects that are right over the probability that was stated.
+//! Reliability diagrams: the share of objects that are right, over the stated probability.
 
 use std::path::Path;
 

@@ -1,4 +1,4 @@
-//! Nodes in this process that can be killed as a process is, vehicles that report, and what they all missed.
+//! Nodes in this process that can be killed like processes, vehicles that report, and the maps that the nodes missed.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use crate::{PLACES, SEEN};
 
 const REPORT_PERIOD: Duration = Duration::from_millis(100);
 
-/// The nodes that live, and the map logs of all that ever did.
+/// The running nodes, and the map logs of all nodes.
 pub(crate) struct Cell {
     directory: TempDir,
     runs: usize,
@@ -35,9 +35,9 @@ pub(crate) struct Cell {
 pub(crate) struct Record {
     /// Longest time between two maps.
     pub(crate) gap_ms: u128,
-    /// Rounds that a node did not get between two that it got.
+    /// Rounds that a node did not receive between two received rounds.
     pub(crate) missed: u64,
-    /// Maps that are no later than the one before.
+    /// Maps that are not later than the map before.
     pub(crate) stale: usize,
 }
 
@@ -50,7 +50,7 @@ impl Cell {
         })
     }
 
-    /// Starts a node that finds the others by their addresses; a vehicle begins to report.
+    /// Starts a node that finds the others by their addresses. A vehicle then starts to report.
     pub(crate) async fn start(&mut self, name: &'static str, role: Role) -> anyhow::Result<()> {
         self.runs += 1;
         let mut config = NodeConfig {
@@ -93,7 +93,7 @@ impl Cell {
         Ok(())
     }
 
-    /// The leadership that all nodes follow and have maps of, if there is one.
+    /// The leadership that all nodes follow and receive maps from, if there is one.
     pub(crate) fn epoch(&self) -> Option<Epoch> {
         let epoch = |(node, _): &(NodeHandle, Runtime)| {
             let followed = node.leadership().borrow().epoch.clone()?;
@@ -107,7 +107,7 @@ impl Cell {
             .then_some(first)
     }
 
-    /// Labels of each place by the map, and by the votes.
+    /// Labels of each landmark by the map, and by the votes.
     pub(crate) fn agreed(&self) -> (String, String) {
         let Some((node, _)) = self.nodes.values().next() else {
             return Default::default();
@@ -143,7 +143,7 @@ impl Cell {
         )
     }
 
-    /// Maps that all nodes took from then on, by their logs.
+    /// Maps that all nodes accepted from then on, by their logs.
     pub(crate) fn record(&self, from: Timestamp) -> anyhow::Result<Record> {
         let mut record = Record::default();
         for entry in std::fs::read_dir(self.directory.path())? {
@@ -177,7 +177,7 @@ impl Cell {
         Ok(record)
     }
 
-    /// Ends all tasks of a node where they are; its connections break, and nobody is told.
+    /// Ends all tasks of a node at once. Its connections break without a farewell.
     pub(crate) fn kill(&mut self, name: &str) -> anyhow::Result<()> {
         let (node, runtime) = self
             .nodes
@@ -198,7 +198,7 @@ impl Cell {
     }
 }
 
-/// Publishes for ever what a vehicle sees: for the map, with all places in view, and as votes.
+/// Publishes the detections of a vehicle until it ends: for the map, with all landmarks in view, and as votes.
 async fn report(node: NodeName, seen: &[(usize, &str)], gateway: ActorSlot<GatewayMessage>) {
     let mut ticks = tokio::time::interval(REPORT_PERIOD);
     for seq in 0.. {

@@ -1,12 +1,12 @@
-//! A cell of an edge and three vehicles that loses its leaders, one after the other, and gets them back.
+//! A cell of an edge and three vehicles that loses and regains its leaders one after the other.
 //!
 //! `cargo run --example mixed_aggregation`
 //!
-//! All nodes run in this process, each on a runtime of its own and with its own broker and sockets on loopback.
-//! Shutting a runtime down ends a node as SIGKILL ends a process: its connections break, and nobody is told. The
-//! vehicles have no cameras; what they would see is published through their gateways ten times a second. Figures are
-//! from the maps that the nodes accepted, as their map logs tell. The program fails unless the cell is served by one
-//! leader after every step, and nobody accepts a superseded map.
+//! All nodes run in this process, each on a separate runtime with a separate broker and sockets on loopback. Shutting a
+//! runtime down ends a node like SIGKILL ends a process: its connections break without a farewell. The vehicles have no
+//! cameras; their detections are published through their gateways ten times a second. Figures are from the maps that
+//! the nodes accepted, by their map logs. The program fails if a step ends without one leader that serves the cell, or
+//! if a node accepts a superseded map.
 
 mod cell;
 
@@ -21,11 +21,11 @@ use tokio::runtime::Builder;
 
 use cell::{Cell, Record};
 
-/// The places of the cell and metres east; nobody is at the last.
+/// The landmarks of the cell and metres east; the last landmark is empty.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("slot-2", 6.0)];
 
-/// Labels that each vehicle reads, by place; all have all places in view, and noether misreads the first: without
-/// euclid, the map cannot tell who is right.
+/// Labels that each vehicle reads, by landmark. All vehicles have all landmarks in view, and noether misreads the first
+/// landmark: without euclid, the map cannot decide between the two labels.
 const SEEN: [(&str, &[(usize, &str)]); 3] = [
     ("euclid", &[(0, "ABC123"), (1, "XYZ789")]),
     ("gauss", &[(0, "ABC123"), (1, "XYZ789")]),
@@ -34,11 +34,11 @@ const SEEN: [(&str, &[(usize, &str)]); 3] = [
 
 /// A fault, or its end.
 enum Step {
-    /// The edge starts; it is to lead in the end.
+    /// The edge starts, and leads at the end of the step.
     StartEdge,
-    /// All vehicles start that are not there.
+    /// All absent vehicles start.
     StartVehicles,
-    /// Whoever leads is killed; another is to lead in the end.
+    /// The leader is killed, and another node leads at the end of the step.
     KillLeader,
 }
 
@@ -52,10 +52,10 @@ const SCRIPT: [Step; 7] = [
     Step::KillLeader,
 ];
 
-/// Time in which all nodes must be served by one leader again.
+/// Maximum time until one leader serves all nodes again.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Time between recovery and the next step: all have links to the leader and to the standby that it named.
+/// Time between recovery and the next step: all nodes have links to the leader and to its standby.
 const CALM: Duration = Duration::from_secs(2);
 
 fn main() -> anyhow::Result<()> {
@@ -78,7 +78,7 @@ fn main() -> anyhow::Result<()> {
     })
 }
 
-/// Carries out the script; every step has a line when it is done and one when all are served again.
+/// Carries out the script and prints a line when a step is done and when all nodes are served again.
 async fn play(cell: &mut Cell) -> anyhow::Result<()> {
     let started = clock::now();
     let age = || clock::now().since(started).as_secs_f64();
@@ -121,14 +121,14 @@ async fn carry_out(step: &Step, cell: &mut Cell) -> anyhow::Result<String> {
             format!("{} started", missing.join(", "))
         }
         Step::KillLeader => {
-            let epoch = cell.epoch().context("nobody leads")?;
+            let epoch = cell.epoch().context("no leader")?;
             cell.kill(epoch.leader.as_str())?;
             format!("{} killed", epoch.leader)
         }
     })
 }
 
-/// Waits until all nodes take the maps of one that is there, which is the edge if that is there.
+/// Waits until all nodes accept maps of one running node, which is the edge if it runs.
 async fn recovered(cell: &Cell) -> Epoch {
     loop {
         if let Some(epoch) = cell.epoch()

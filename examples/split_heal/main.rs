@@ -1,13 +1,14 @@
-//! A cell of four vehicles that falls in two and heals: two leaders, two maps, then one again, and no evidence lost.
+//! A cell of four vehicles that splits in two halves and heals: two leaders and two maps, then one of each again,
+//! without loss of evidence.
 //!
 //! `cargo run --example split_heal`
 //!
-//! A simulation: leadership, round filter, aggregator and replication of each vehicle are those that a node runs, and what travels is
-//! encoded and decoded, but time is a number and the network a queue, so that every run is the same. Cells of real
-//! processes are split by `make trials`, in network namespaces.
+//! This is a simulation: leadership, round filter, aggregator and replication of each vehicle are the code of a node,
+//! and messages are encoded and decoded, but time is a number and the network a queue, so that all runs are equal.
+//! `make trials` splits cells of real processes in network namespaces.
 //!
-//! Euclid and gauss see slot-0, noether and turing slot-1, and all read a sign, which turing gets wrong. The program
-//! fails unless, in the end, one leads and every ledger holds the evidence of both sides once.
+//! Euclid and gauss read slot-0, noether and turing slot-1, and all read a sign, which turing misreads. The program
+//! fails unless, at the end, one vehicle leads and every ledger contains the evidence of both halves once.
 
 mod vehicle;
 
@@ -23,10 +24,10 @@ use ecod::wire::{ObjectReport, PerceivedObject};
 
 use vehicle::{Payload, Vehicle};
 
-/// Places and metres east.
+/// Landmarks and metres east.
 const PLACES: [(&str, f64); 3] = [("slot-0", 0.0), ("slot-1", 3.0), ("sign", 6.0)];
 
-/// Labels that each vehicle reads, by place.
+/// Labels that each vehicle reads, by landmark.
 const SEEN: [(&str, [(usize, &str); 2]); 4] = [
     ("euclid", [(0, "ABC123"), (2, "stop")]),
     ("gauss", [(0, "ABC123"), (2, "stop")]),
@@ -38,7 +39,7 @@ const START: Timestamp = Timestamp(1_732_154_400_000_000);
 const REPORT_MS: u64 = 100;
 /// Travel time of a packet, which is also the step of time.
 const TRAVEL: Duration = Duration::from_millis(1);
-/// Until the memberships know who is gone or back.
+/// Time until the memberships report a vehicle as down or up.
 const NOTICE_MS: u64 = 300;
 
 fn main() -> anyhow::Result<()> {
@@ -97,7 +98,7 @@ impl Cell {
         }
     }
 
-    /// Cuts or mends the links between the halves; the memberships find out a while later.
+    /// Cuts or restores the links between the halves; the memberships report it later.
     fn split(&mut self, is_split: bool, event: &str) -> anyhow::Result<()> {
         self.is_split = is_split;
         self.tell(event);
@@ -137,7 +138,7 @@ impl Cell {
         Ok(())
     }
 
-    /// Takes what the vehicle sends as far as links reach, and tells its news.
+    /// Sends the vehicle's messages over the existing links, and prints its events.
     fn post(&mut self, from: usize) {
         for (addressee, payload) in std::mem::take(&mut self.vehicles[from].outbox) {
             for to in (0..SEEN.len()).filter(|to| *to != from) {
@@ -159,7 +160,7 @@ impl Cell {
         }
     }
 
-    /// Says what happened and what map each side has.
+    /// Prints an event and the map of each half.
     fn tell(&self, event: &str) {
         let view = |vehicle: &Vehicle| {
             let Some(map) = &vehicle.map else {
@@ -185,7 +186,8 @@ impl Cell {
         );
     }
 
-    /// One leads, all have its map, and every ledger holds what was settled in every leadership once.
+    /// Checks that one vehicle leads, that all accept its map, and that every ledger contains the evidence of every
+    /// leadership once.
     fn check(&self) -> anyhow::Result<()> {
         println!("\nvotes settled, and in the ledgers of the vehicles");
         let settled: BTreeMap<_, _> = self
@@ -204,7 +206,7 @@ impl Cell {
             };
             let held: Vec<_> = self.vehicles.iter().map(held).collect();
             println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
-            ensure!(*settled > 0, "{epoch} settled nothing");
+            ensure!(*settled > 0, "{epoch} settled no votes");
             ensure!(
                 held.iter().all(|held| held == settled),
                 "evidence of {epoch} was lost or counted twice"

@@ -1,4 +1,4 @@
-//! One vehicle: what a node runs, without clock, sockets and actors.
+//! One vehicle: the parts of a node without clock, sockets and actors.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
@@ -25,7 +25,7 @@ use ecod::wire::{
 };
 use uuid::Uuid;
 
-/// Messages between vehicles, on their way.
+/// Messages in transit between vehicles.
 #[derive(Debug, Clone)]
 pub(crate) enum Payload {
     Election(Vec<u8>),
@@ -49,17 +49,18 @@ pub(crate) struct Vehicle {
     rounds_due: u64,
     /// Time of the fuser's next timer; it may be early.
     alarm: Timestamp,
-    /// The last map that it accepted.
+    /// The last map that the vehicle accepted.
     pub(crate) map: Option<GlobalMap>,
-    /// Votes that it settled in each of its leaderships.
+    /// Votes that the vehicle settled in each of its leaderships.
     pub(crate) settled: BTreeMap<Epoch, u64>,
     /// Messages to be sent, to one vehicle or to all.
     pub(crate) outbox: Vec<(Option<NodeName>, Payload)>,
-    /// News for the reader.
+    /// Events for the output.
     pub(crate) news: Vec<String>,
 }
 
-/// Time between two publications of what changed in the ledger, and how many make up a period in which all is sent.
+/// Time between two publications of changes of the ledger, and number of publications until the whole ledger is
+/// published.
 const SHARE_PERIOD: Duration = Duration::from_secs(1);
 const SHARES_PER_SNAPSHOT: u32 = 3;
 
@@ -125,7 +126,7 @@ impl Vehicle {
         }
     }
 
-    /// Takes the membership's news of another vehicle.
+    /// Processes an event of the membership about another vehicle.
     pub(crate) fn notice(&mut self, member: SeenMember, is_there: bool, now: Timestamp) {
         if is_there {
             self.members.insert(member.name.clone(), member.clone());
@@ -186,7 +187,7 @@ impl Vehicle {
         Ok(())
     }
 
-    /// Sends what it sees, for the map and as votes, and uses it itself.
+    /// Sends the vehicle's detections, for the map and as votes, and passes them to its own aggregator.
     pub(crate) fn report(&mut self, report: ObjectReport, now: Timestamp) -> anyhow::Result<()> {
         let report = Arc::new(report);
         for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
@@ -210,7 +211,7 @@ impl Vehicle {
             .map_or(Ok(()), |fused| self.publish(fused, now))
     }
 
-    /// Publishes a round of its own, and keeps what the round says of vehicles in the lane of its epoch.
+    /// Publishes a round of this vehicle, and adds the round's evidence to the lane of its epoch.
     fn publish(&mut self, fused: Fused, now: Timestamp) -> anyhow::Result<()> {
         let Fused {
             epoch,
@@ -228,7 +229,7 @@ impl Vehicle {
         Ok(())
     }
 
-    /// Takes a map that its filter accepts.
+    /// Processes a map if the filter accepts it.
     fn accept(&mut self, map: GlobalMap, now: Timestamp) {
         let Ok(accepted) = self
             .filter
@@ -286,7 +287,7 @@ impl Vehicle {
         }
     }
 
-    /// Does what the machine wants; returns what it is to be told.
+    /// Carries out an effect of the machine, and returns the input that results from it.
     fn carry_out(&mut self, effect: Effect, now: Timestamp) -> Option<Input> {
         match effect {
             Effect::Send { to, message } => {
@@ -336,7 +337,7 @@ impl Vehicle {
                 };
                 return Some(Input::PartsAnswered { sample });
             }
-            // Nobody restarts here, and everybody sends to all.
+            // In this simulation vehicles do not restart, and all messages reach all vehicles.
             Effect::PersistTerm { .. }
             | Effect::SetLinks { .. }
             | Effect::PublishStatus { .. }

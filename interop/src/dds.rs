@@ -110,7 +110,7 @@ pub enum RosBridgeError {
     /// A topic below `/ecod`, which a bridge publishes. If it were reported, the cell's messages
     /// would confirm themselves.
     #[error(
-        "{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself"
+        "{0} is not a detector topic: topics below /ecod are published by bridges, so the cell would receive its own objects as reports"
     )]
     OwnTopic(String),
     /// The cell cannot be joined.
@@ -379,7 +379,7 @@ impl RosBridge {
         for DetectorInput { topic, kind, heard } in lock(&self.inputs).iter() {
             if !heard.load(Ordering::Relaxed) {
                 log::warn!(
-                    "nothing on {topic} in {PATIENCE:?}: are topic, type ({kind}), domain and network those of its node?"
+                    "no message on {topic} in {PATIENCE:?}: check topic, type ({kind}), domain and network of the publisher"
                 );
             }
         }

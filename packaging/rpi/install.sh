@@ -1,9 +1,9 @@
-# Run by firstrun.sh, before there is a network: the service of packaging/rpi does the rest at the next boot. The power may fail at any
-# time; firstrun.sh then runs this again. Nothing leaves the boot partition before it is on the Pi's own.
+# firstrun.sh runs this script before the network is up; the service of packaging/rpi completes the installation at the next boot. After
+# a power failure firstrun.sh runs this script again: files are removed from the boot partition only after they are on the Pi's own.
 set -eu
 from=/boot/firmware/ecod
 to=/var/lib/ecod-first-boot
-# An error is in the journal, and on the card beside the token.
+# Writes an error to the journal, and to the card next to the token.
 exec 3>&2 2>"$from/problem.txt"
 trap 'cat "$from/problem.txt" >&3' EXIT
 

@@ -6,7 +6,7 @@
 //! cli       the program
 //! page      page, API and metrics over HTTP     export  GeoJSON, MCAP
 //! reader    the connection to the broker
-//! town      the latest of each cell, and which of it is in view
+//! town      latest messages of each cell; selection for a view
 //! broker    address and login                   account rights of a cell
 //! ```
 

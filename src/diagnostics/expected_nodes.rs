@@ -35,8 +35,8 @@ pub struct MissingNode {
 /// check on it is missing, until it answers again, or an operator dismisses it. A stop in order
 /// sends a status with `euclid` in its own list of dismissed nodes, so that it is not missing.
 ///
-/// Programs and observers beside a node have a name with a part and are not expected. Neither are
-/// visitors: vehicles that move from cell to cell, which dismiss themselves while they are present.
+/// A name with a part belongs to a program or an observer of a node. Such names are not expected, and visitors are not
+/// expected either: a visitor is a vehicle that moves from cell to cell, and it dismisses itself while it is present.
 #[derive(Debug, Clone, Default)]
 pub struct ExpectedNodes {
     nodes: BTreeMap<NodeName, ExpectedNode>,
@@ -120,7 +120,7 @@ impl ExpectedNodes {
         self.dismissed.iter().cloned().collect()
     }
 
-    /// True if the node was a member, and has neither left nor been dismissed.
+    /// True if the node was a member and has not left or been dismissed since.
     pub fn contains(&self, name: &NodeName) -> bool {
         self.nodes.contains_key(name)
     }

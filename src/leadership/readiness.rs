@@ -244,10 +244,13 @@ mod tests {
         let told = |leadership: &Leadership| {
             let judged = Readiness::judge(leadership, None, false, None, Timestamp(0));
             judged
-                .because(Some("heard cell lot-1 with another key from 10.0.0.7"))
+                .because(Some(
+                    "received a datagram of cell lot-1 with another key from 10.0.0.7",
+                ))
                 .reason
         };
-        let alone = "no leader known: heard cell lot-1 with another key from 10.0.0.7";
+        let alone =
+            "no leader known: received a datagram of cell lot-1 with another key from 10.0.0.7";
         assert_eq!(told(&Leadership::default()), alone);
         let following = Leadership {
             position: Position::Following,

@@ -163,8 +163,9 @@ pub fn plain_text(text: &str, max_bytes: usize) -> String {
     kept
 }
 
-/// True if a character breaks lines or turns the direction of the text around it: a label with one
-/// would show another's text on pages and terminals (Unicode Technical Report 36, section 2.7).
+/// True if a character breaks lines or changes the direction of the surrounding text. A label with
+/// such a character could make other text on a page or terminal appear as something else (Unicode
+/// Technical Report 36, section 2.7).
 fn is_layout_control(c: char) -> bool {
     matches!(c, '\u{61C}' | '\u{200E}' | '\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
 }

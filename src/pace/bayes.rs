@@ -17,8 +17,8 @@
 //! and have equal priors. The position is the mean of the vehicles' last positions weighted by
 //! their inverse covariances.
 //!
-//! A vacancy sign is a second place with its own log-odds. Any object outweighs it, because a sign
-//! behind an object can still be seen from the side. A landmark counts as empty if vehicles had it
+//! The vacancy sign of a landmark has separate log-odds. A detected object takes precedence, because
+//! a sign behind an object can still be seen from the side. A landmark counts as empty if vehicles had it
 //! in view without a detection: it then gets the label of its vacancy sign, or null without a sign.
 
 mod belief;

@@ -193,9 +193,9 @@ impl ReputationLedger {
         latest
     }
 
-    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest,
-    /// without the very latest ones, whose number `own` returns. Each lane's votes are divided
-    /// among labels as in the whole lane.
+    /// The (correct, incorrect) votes of every vehicle by stated label. Takes the `memory_votes`
+    /// latest votes of each vehicle after skipping the newest `own(vehicle)` votes. If only part of
+    /// a lane is used, its labels keep the proportions of the whole lane.
     pub fn remembered(
         &self,
         memory_votes: f64,

@@ -3,9 +3,10 @@
 //! Every track is a hypothesis in information form: Y = P⁻¹ and y = Y·x of its predicted position. The vehicles are
 //! assigned one after the other by global nearest neighbour (Blackman, Popoli, "Design and Analysis of Modern Tracking
 //! Systems", 1999, chapter 6). The information of each assigned detection is added, so that the next vehicle is compared
-//! with the prediction and the others' detections. A second pass takes out a vehicle's own detections first and assigns it
-//! again: iterated conditional modes of the multi-sensor assignment (Besag, "On the statistical analysis of dirty
-//! pictures", 1986). Detections that no hypothesis explains open a new one, which the following vehicles may join.
+//! with the prediction and the others' detections. A second pass subtracts the detections of one vehicle at a time and
+//! assigns them again: iterated conditional modes of the multi-sensor assignment (Besag, "On the statistical analysis
+//! of dirty pictures", 1986). A detection that no hypothesis explains opens a new hypothesis, which the following
+//! vehicles may join.
 //!
 //! The benefit of a pair is its log-likelihood ratio to a detection of clutter or of a new object (Bar-Shalom, Li,
 //! "Multitarget-Multisensor Tracking", 1995, section 2.4).
@@ -28,27 +29,27 @@ use super::track::{MIN_LABEL_SIMILARITY, Track};
 use crate::association::{Candidate, ClusterSize, assign};
 use crate::model::time::Timestamp;
 
-/// Passes over the scans of an instant, if there are several.
+/// Number of passes over the scans of an instant that has several scans.
 const PASSES: usize = 2;
 
-/// Minimum probability that a track is detected: tracks of little existence must be able to recover.
+/// Minimum probability that a track is detected, so that tracks of low existence can recover.
 const MIN_DETECTED: f64 = 0.2;
 
-/// Probability that a hypothesis of this instant is an object.
+/// Probability that a new hypothesis of this instant is an object.
 const NEW_EXISTENCE: f64 = 0.5;
 
-/// Number of detections in one cluster beyond which the best pairs are taken one after the other.
+/// Number of detections in a cluster above which the assignment is greedy, the best pair first.
 const MAX_CLUSTER: usize = 48;
 
-/// Maximum age of a new track that may have any velocity.
+/// Maximum age of a new track that is associated as an object of any velocity.
 const FAST_WITHIN: Duration = Duration::from_millis(250);
 
-/// Maximum number of detections of a scan that are compared with such tracks. A scan with more is the first of the cell,
-/// or a vehicle fabricates them.
+/// Maximum number of detections of a scan that are compared with such tracks. A scan with more detections is the first
+/// scan of the cell, or its vehicle fabricates detections.
 const MAX_FAST: usize = 64;
 
-/// Maximum number of new hypotheses in one square of the gate's side that are compared with a detection; nine squares are
-/// searched.
+/// Maximum number of new hypotheses that are compared with a detection in each of the nine squares around it, whose
+/// side is the gate.
 const MAX_NEW_NEAR: usize = 16;
 
 /// Maximum number of tracks that are compared with a detection, the nearest first.
@@ -57,7 +58,7 @@ const MAX_TRACKS_NEAR: usize = 64;
 /// Probability of a detection by a vehicle whose view is unknown.
 const UNKNOWN_RATE: f64 = 0.5;
 
-/// What may have caused detections of this instant.
+/// A possible cause of detections of this instant.
 #[derive(Debug)]
 pub(super) struct Hypothesis {
     /// The track; `None` for an object that begins here.
@@ -102,7 +103,7 @@ impl Information {
 }
 
 impl Hypothesis {
-    /// Position and covariance of all its detections together.
+    /// Position and covariance of all detections of the hypothesis together.
     pub(super) fn detected(&self) -> Option<(Vector2<f64>, Matrix2<f64>)> {
         let mut detected = self.information;
         detected.add(&self.prior, -1.0);
@@ -379,7 +380,7 @@ impl<'a> Assignment<'a> {
     }
 }
 
-/// Of a cluster that is too large, the pairs taken one after the other, the best first.
+/// Greedy assignment of a large cluster: the best pair first.
 fn greedy_if_large(size: ClusterSize, cluster: &[GatedPair]) -> Option<Vec<GatedPair>> {
     (size.rows > MAX_CLUSTER).then(|| {
         let mut by_benefit = cluster.to_vec();

@@ -1,8 +1,8 @@
-//! Calibration of a vehicle's confidences: how much likelier each is of an object than of clutter.
+//! Calibration of a vehicle's confidences: how much more likely each confidence is for an object than for clutter.
 //!
 //! Two histograms count the confidences of detections by the probability that their track is an object. That
-//! probability follows from the results of looks alone, so that confidences do not confirm themselves. Without
-//! evidence, a confidence is the probability that it states, relative to `even_confidence`.
+//! probability follows from observations alone, so that confidences do not confirm themselves. Without evidence, a
+//! confidence is the probability that it states, relative to `even_confidence`.
 
 /// Estimated relation between confidence and evidence of one vehicle.
 #[derive(Debug, Clone)]
@@ -37,7 +37,7 @@ fn bin(log_odds: f64) -> usize {
 }
 
 impl DetectionCalibration {
-    /// A calibration by which detections of `even_confidence` are as likely objects as clutter.
+    /// A calibration without evidence: a detection of `even_confidence` is equally likely to be an object and clutter.
     pub(super) fn new(even_confidence: f64) -> Self {
         let even = log_odds(even_confidence);
         let share = |bin: usize| {

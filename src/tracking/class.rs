@@ -1,4 +1,4 @@
-//! Classes of objects: how they move, and how many there may be.
+//! Classes of objects: their motion and their density.
 //!
 //! All classes move with nearly constant velocity (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
 //! and Navigation", 2001, section 6.2.2). Only the parameters depend on the class.
@@ -14,7 +14,8 @@ pub(super) struct ObjectClass {
     pub(super) speed_mps: f64,
     /// Maximum speed, m/s.
     pub(super) max_speed_mps: f64,
-    /// Standard deviation in metres of the error that all positions of an object may share; it is never averaged away.
+    /// Standard deviation in metres of the error that all positions of an object may share. Averaging does not reduce
+    /// this error.
     pub(super) common_m: f64,
     /// Density of new objects and clutter in one frame, 1/m².
     pub(super) new_per_m2: f64,
@@ -36,7 +37,7 @@ const PERSON: ObjectClass = ObjectClass {
 const VEHICLES_PER_M2: f64 = 3e-4;
 
 impl ObjectClass {
-    /// The class of objects with this label: vehicles, unless the label is of people.
+    /// The class of objects with this label: people for the labels of people, otherwise vehicles.
     pub(super) fn of(label: &str, config: &TracksConfig) -> Self {
         let vehicle = Self {
             manoeuvre_mps: config.manoeuvre_mps,

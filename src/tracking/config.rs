@@ -7,16 +7,16 @@ use super::pose_bias::BiasPrior;
 use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, is_label};
 
-/// Cells in which objects at no known location are tracked.
+/// The cells that track objects away from landmarks.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TracksMode {
-    /// In a cell without known locations.
+    /// Cells without landmarks.
     #[default]
     Auto,
-    /// Everywhere: objects that are not within PACE's gate of a known location.
+    /// All cells; objects that are not within PACE's gate of a landmark.
     On,
-    /// Nowhere.
+    /// No cells.
     Off,
 }
 
@@ -24,22 +24,23 @@ pub enum TracksMode {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TracksConfig {
-    /// When objects are tracked: `auto`, the default, in a cell without known locations; `on`; `off`.
+    /// Cells that track objects: `auto` (default: cells without landmarks), `on` or `off`.
     pub mode: TracksMode,
     /// Standard deviation in metres, in each direction, of near positions without covariance, until it
     /// is estimated; 0.012 m more for each metre of distance. Default 0.15.
     pub noise_m: f64,
     /// Minimum standard deviation in metres of any reported position. Default 0.1.
     pub noise_floor_m: f64,
-    /// Standard deviation in metres of the error that all positions of a vehicle may share; it is never averaged away.
-    /// Default 0.2. Trade-off: more merges what vehicles with poor poses see; less tells closer objects apart.
+    /// Standard deviation in metres of the error that all positions of a vehicle may share. Averaging does not reduce
+    /// this error. Default 0.2. Trade-off: a larger value merges detections of vehicles with poor poses; a smaller
+    /// value separates closer objects.
     pub common_m: f64,
     /// Maximum distance of a detection from its track in standard deviations. Default 3.5.
     pub gate_sigmas: f64,
     /// Maximum distance of a detection from its track in metres. Default 4.
     pub gate_m: f64,
-    /// Standard deviation in metres per second of the change of velocity within a second. Default 2.2. Trade-off: more
-    /// follows manoeuvres; less smooths.
+    /// Standard deviation in metres per second of the change of velocity within a second. Default 2.2. Trade-off: a
+    /// larger value follows manoeuvres; a smaller value smooths.
     pub manoeuvre_mps: f64,
     /// Standard deviation of an object's unknown velocity in metres per second, in each direction. Default 8.
     pub speed_mps: f64,
@@ -50,15 +51,17 @@ pub struct TracksConfig {
     /// Maximum time in seconds for which an object keeps its identity after its last detection, published or not.
     /// Default 8.
     pub latent_s: f64,
-    /// Maximum time in seconds of a report behind the latest that was fused. Default 0.5; later reports are counted.
+    /// Maximum time in seconds of a report behind the latest report that was fused. Default 0.5; later reports are
+    /// counted.
     pub max_lag_s: f64,
-    /// Confidence at which a detection is as likely real as not, until it is estimated. Default 0.3.
+    /// Confidence at which a detection is equally likely to be real and false, until it is estimated. Default 0.3.
     pub even_confidence: f64,
-    /// Minimum confidence of a published object. Default 0.002: users that need certainty set a limit of their own.
+    /// Minimum confidence of a published object. Default 0.002: a user that needs certainty sets a higher limit.
     pub min_confidence: f64,
-    /// Distance in metres from a vehicle's pose within which it detects itself, and others detect it. Default 1.5.
+    /// Distance in metres from a vehicle's pose within which detections are of the vehicle itself. Default 1.5.
     pub vehicle_radius_m: f64,
-    /// Label of a vehicle that no other has detected. Default `car`: the label that the cell's detectors give vehicles.
+    /// Label of a vehicle that no other vehicle has detected. Default `car`: the label that the cell's detectors give
+    /// vehicles.
     pub vehicle_label: Label,
     /// Estimation and correction of the offsets and rotations of vehicles' poses, and of the delays of their stamps.
     /// Default true.
@@ -67,8 +70,8 @@ pub struct TracksConfig {
     pub align_offset_m: f64,
     /// Standard deviation in radians of a pose's rotation. Default 0.01.
     pub align_heading_rad: f64,
-    /// Standard deviation in seconds of the delay of a vehicle's stamps, beyond the known offset of its clock. Default
-    /// 0.02. At most three times as much is corrected.
+    /// Standard deviation in seconds of the delay of a vehicle's stamps, in addition to the measured offset of its
+    /// clock. Default 0.02. The correction is at most three times as large.
     pub align_delay_s: f64,
     /// Time constant in seconds of the errors of a pose. Default 10.
     pub align_memory_s: f64,

@@ -1,4 +1,4 @@
-//! Coverage of a vehicle's sensor: where it detects objects, and with which probability.
+//! Coverage of a vehicle's sensor: where the sensor detects objects, and with which probability.
 
 use std::f64::consts::PI;
 
@@ -47,7 +47,7 @@ impl Coverage {
     /// Maximum range, metres.
     const MAX_RANGE_M: f64 = 160.0;
 
-    /// Distance in metres that no vehicle covers between two reports.
+    /// Distance in metres that is too large for any vehicle between two reports.
     const JUMP_M: f64 = 500.0;
 
     /// Updates the field of view from a report; true if the vehicle has jumped to another place.
@@ -104,7 +104,7 @@ impl Coverage {
             .min(Self::MAX_RANGE_M)
     }
 
-    /// Detection rates at a reported position, if nothing hides it; `None` outside the field of view.
+    /// Detection rates at a reported position without occlusion; `None` outside the field of view.
     pub(super) fn rates_at(&self, reported: &Vector2<f64>) -> Option<&DetectionRates> {
         let offset = reported - self.centre?;
         let distance_m = offset.norm();
@@ -114,7 +114,8 @@ impl Coverage {
         Some(&self.rates[Self::bin(distance_m)])
     }
 
-    /// Updates the rates with a look at an object that exists with a probability; `state` is that before the look.
+    /// Updates the rates with an observation of an object that exists with a probability; `state` is the state before
+    /// the observation.
     pub(super) fn learn(
         &mut self,
         reported: &Vector2<f64>,
@@ -168,7 +169,7 @@ pub(super) fn turn(offset: &Vector2<f64>) -> f64 {
     }
 }
 
-/// The median of the detections in each direction, which no outlier moves far.
+/// The median of the detections in each direction, which is robust against outliers.
 fn median(report: &ObjectReport) -> Option<Vector2<f64>> {
     let median = |coordinate: fn(&PerceivedObject) -> f64| {
         let mut values: Vec<f64> = report.objects.iter().map(coordinate).collect();

@@ -1,4 +1,4 @@
-//! Detection history of one track: a slot for each vehicle that looked at it.
+//! Detection history of one track: a slot for each vehicle that observed its place.
 
 use std::time::Duration;
 
@@ -11,14 +11,15 @@ use crate::model::time::Timestamp;
 /// Maximum number of vehicles in a track's history.
 const MAX_SLOTS: usize = 32;
 
-/// Time after its vehicle's last look after which a slot is free. If newcomers could take slots earlier, none of more
-/// than [`MAX_SLOTS`] vehicles would stay long enough to be judged.
+/// Time after the last observation of a vehicle after which its slot is free. If slots were free earlier, more than
+/// [`MAX_SLOTS`] vehicles would replace each other before any of them could be judged.
 const SLOT_KEPT: Duration = Duration::from_secs(1);
 
 /// Detections and misses of one track by vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct DetectionHistory {
-    /// Vehicles by slot, apart from their histories: every look searches them, and a history is some 20 times as large.
+    /// Vehicles by slot, in a separate list: every observation searches the vehicles, and a history is some 20 times as
+    /// large.
     sensors: SmallVec<[SensorId; 12]>,
     histories: Vec<SensorHistory>,
 }
@@ -39,7 +40,7 @@ impl DetectionHistory {
         self.slot_of(sensor).map(|slot| &self.histories[slot])
     }
 
-    /// State of a vehicle before its next look.
+    /// State of a vehicle before its next observation.
     pub(super) fn state_of(&self, sensor: SensorId) -> LookState {
         self.get(sensor)
             .map_or(LookState::First, |history| history.state)
@@ -50,7 +51,7 @@ impl DetectionHistory {
         self.find_slot(sensor, at).is_some()
     }
 
-    /// The history of a vehicle that looks at the object, if there is room for it.
+    /// The history of a vehicle that observes the place of the object, if there is room for the history.
     pub(super) fn for_look(
         &mut self,
         sensor: SensorId,
@@ -60,7 +61,7 @@ impl DetectionHistory {
         Some(self.occupy(slot, sensor, at))
     }
 
-    /// The history of a vehicle that detects the object; it may replace one that never did.
+    /// The history of a vehicle that detects the object. It may replace the history of a vehicle without detections.
     pub(super) fn for_hit(
         &mut self,
         sensor: SensorId,
@@ -81,14 +82,14 @@ impl DetectionHistory {
         self.histories.clear();
     }
 
-    /// Removes the vehicles that are not `known`.
+    /// Removes all vehicles for which `known` returns false.
     pub(super) fn retain(&mut self, known: impl Fn(SensorId) -> bool) {
         self.histories.retain(|history| known(history.sensor));
         self.sensors.retain(|sensor| known(*sensor));
     }
 
-    /// Merges the history of another track of the same object. Of two histories of one vehicle, the one with the later
-    /// detection stays.
+    /// Merges the history of a duplicate track. If both tracks have a history of a vehicle, the history with the later
+    /// detection remains.
     pub(super) fn merge(&mut self, other: Self) {
         for theirs in other.histories {
             match self.slot_of(theirs.sensor) {

@@ -1,14 +1,15 @@
-//! Probability that an object exists, from what every vehicle found when it looked.
+//! Probability that an object exists, from the observations of all vehicles.
 //!
-//! This is integrated probabilistic data association (Musicki, Evans, Stankovic, 1994). Each look of a vehicle at a
-//! place adds the log-likelihood ratio of its result: a detection or none, if an object is there and if the track is
-//! clutter. Looks of one vehicle are not independent: what hides an object, or looks like one, is still there a tenth
-//! of a second later. So the results of one vehicle are a Markov chain under both hypotheses, and the probability of a
-//! detection depends on the [result before](LookState). All probabilities are estimated by vehicle. Between looks, an
-//! object may leave.
+//! This is integrated probabilistic data association (Musicki, Evans, Stankovic, 1994). An observation is one frame's
+//! check of a track by one vehicle; its result is a detection or a miss. Each observation adds the log-likelihood ratio
+//! of its result under two hypotheses: the track is an object, or it is clutter. Observations of one vehicle are
+//! correlated: an occluder, or a structure that resembles an object, is still there a tenth of a second later. So the
+//! results of one vehicle are a Markov chain under both hypotheses, and the probability of a detection depends on the
+//! [previous results](LookState). All probabilities are estimated by vehicle. Between observations, an object may
+//! leave.
 //!
-//! Confidences are evidence of their own. Those of one vehicle are correlated: n of them with correlation ρ weigh as
-//! n/(1+ρ(n−1)) (the design effect; Kish, "Survey Sampling", 1965).
+//! Confidences are additional evidence. The confidences of one vehicle are correlated: n confidences with correlation ρ
+//! weigh as n/(1+ρ(n−1)) (the design effect; Kish, "Survey Sampling", 1965).
 
 use std::time::Duration;
 
@@ -17,7 +18,7 @@ use nalgebra::Vector2;
 use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
-/// Time constant in seconds with which confidences, and what one vehicle says of another's object, fade.
+/// Time constant in seconds with which confidences, and a vehicle's evidence about another vehicle's object, fade.
 const MEMORY_S: f64 = 3.0;
 
 /// Correlation of the confidences of successive frames.
@@ -26,35 +27,35 @@ const CORRELATION: f64 = 0.3;
 /// Share of the evidence of confidences that is independent from vehicle to vehicle.
 const CONFIDENCE_WEIGHT: f64 = 0.7;
 
-/// Maximum log-odds of existence by the results of looks; the minimum is twice its negative.
+/// Maximum log-odds of existence from observations; the minimum is -2 times this value.
 const MAX_NATS: f64 = 6.0;
 
-/// Maximum evidence of the looks of one vehicle in the judgement of another, nats.
+/// Maximum evidence of the observations of one vehicle in the judgement of another, nats.
 const MAX_PEER_NATS: f64 = 2.5;
 
-/// Minimum log-odds of a confirmed track at a new detection: it is found again, not born again.
+/// Minimum log-odds of a confirmed track at a new detection, because the detection continues this track.
 const LATENT_NATS: f64 = -3.0;
 
-/// Additional rate per second at which an object leaves that no vehicle detects.
+/// Additional rate per second at which an undetected object leaves.
 const UNSEEN_HZ: f64 = 0.15;
 
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 
-/// Minimum number of looks before a vehicle's statement is judged.
+/// Minimum number of observations before a vehicle's statement is judged.
 const MIN_JUDGED_LOOKS: u32 = 5;
 
-/// Results of a vehicle's looks at an object: the last result, and the number of equal results in a row.
+/// Results of a vehicle's observations of an object: the last result, and the number of equal results in a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum LookState {
-    /// The vehicle has not looked yet.
+    /// The vehicle has not observed the place yet.
     #[default]
     First,
-    /// The vehicle has never detected the object in so many looks.
+    /// The vehicle has observed the place so many times without a detection.
     Never(u8),
-    /// The last looks, so many, were detections.
+    /// So many last observations were detections.
     Hit(u8),
-    /// The last looks, so many, were misses, an earlier one a detection.
+    /// So many last observations were misses, after an earlier detection.
     Miss(u8),
 }
 
@@ -64,7 +65,7 @@ impl LookState {
     /// Number of classes of runs by length: 1, 2 to 3, and longer.
     const RUNS: usize = 3;
 
-    /// The state after another look.
+    /// The state after another observation.
     fn after(self, is_hit: bool) -> Self {
         match (self, is_hit) {
             (Self::Hit(run), true) => Self::Hit(run.saturating_add(1)),
@@ -76,7 +77,7 @@ impl LookState {
         }
     }
 
-    /// True if the last look was a detection.
+    /// True if the last observation was a detection.
     pub(super) fn is_hit(self) -> bool {
         matches!(self, Self::Hit(_))
     }
@@ -97,18 +98,18 @@ impl LookState {
     }
 }
 
-/// Probability of a detection at a look, by the state before it, estimated as the mean of a beta distribution.
+/// Probability of a detection at an observation, by the state before it, estimated as the mean of a beta distribution.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DetectionRates {
-    /// Numbers of detections and of looks.
+    /// Numbers of detections and of observations.
     counts: [(f64, f64); LookState::COUNT],
 }
 
 impl DetectionRates {
-    /// Number of looks as which the usual rates count.
+    /// Number of observations as which the usual rates count.
     const USUAL_LOOKS: f64 = 10.0;
 
-    /// Number of looks beyond which earlier ones are discounted.
+    /// Number of observations beyond which earlier observations are discounted.
     const MEMORY: f64 = 400.0;
 
     fn usual(rates: [f64; LookState::COUNT]) -> Self {
@@ -127,13 +128,13 @@ impl DetectionRates {
         Self::usual([0.05, 0.03, 0.02, 0.01, 0.15, 0.5, 0.6, 0.1, 0.05, 0.02])
     }
 
-    /// The rate at a look in this state.
+    /// The rate at an observation in this state.
     pub(super) fn rate(&self, state: LookState) -> f64 {
         let (hits, looks) = self.counts[state.index()];
         (hits / looks).clamp(0.01, 0.985)
     }
 
-    /// Updates the mean with a look of a weight, 0 to 1.
+    /// Updates the mean with an observation of a weight, 0 to 1.
     pub(super) fn learn(&mut self, state: LookState, is_hit: bool, weight: f64) {
         let (hits, looks) = &mut self.counts[state.index()];
         *hits += weight * f64::from(u8::from(is_hit));
@@ -144,17 +145,17 @@ impl DetectionRates {
     }
 }
 
-/// Probabilities of a detection at one look: if an object is there, and if the track is clutter.
+/// Probabilities of a detection at one observation: if the track is an object, and if it is clutter.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LookRates {
     pub(super) object: f64,
     pub(super) clutter: f64,
-    /// True if the vehicle states its pose: otherwise it may not have looked there.
+    /// True if the vehicle states its pose. Without a pose, the vehicle may not have observed the place.
     pub(super) has_pose: bool,
 }
 
 impl LookRates {
-    /// Log-likelihood ratio of a result, if an object is there and if the track is clutter.
+    /// Log-likelihood ratio of a result: an object compared with clutter.
     pub(super) fn nats(&self, is_hit: bool) -> f64 {
         if is_hit {
             (self.object / self.clutter).ln().max(0.0)
@@ -164,7 +165,7 @@ impl LookRates {
     }
 }
 
-/// Log-odds that a track is an object that is still there, by the results of all looks.
+/// Log-odds that a track is an object that is still there, from all observations.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Existence {
     log_odds: f64,
@@ -189,7 +190,7 @@ impl Existence {
         self.at = self.at.max(at);
     }
 
-    /// The log-odds at `at` without further looks.
+    /// The log-odds at `at` without further observations.
     pub(super) fn log_odds_at(&self, at: Timestamp, leaving_hz: f64, is_detected: bool) -> f64 {
         let rate_hz = leaving_hz + if is_detected { 0.0 } else { UNSEEN_HZ };
         let stays = (-rate_hz * at.since(self.at).as_secs_f64()).exp();
@@ -223,7 +224,7 @@ impl Existence {
     }
 }
 
-/// Looks of one vehicle at one object.
+/// Observations of one object by one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct SensorHistory {
     pub(super) sensor: SensorId,
@@ -233,23 +234,23 @@ pub(super) struct SensorHistory {
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) looks: u32,
-    /// True if the place was in the vehicle's known field of view when nothing hid it last.
+    /// True if the vehicle stated its pose at the last miss without occlusion.
     is_view_known: bool,
-    /// True if the last detection was at a place that is wrong by more than the vehicle states.
+    /// True if the position of the last detection was wrong by more than the vehicle states.
     pub(super) is_shifted: bool,
-    /// Detections and looks since the last judgement.
+    /// Detections and observations since the last judgement.
     unjudged: ExistenceStatement,
     judged_at: Timestamp,
     /// Evidence of the results, nats; it fades.
     sequence: f64,
-    /// Evidence of all misses that nothing hid before the first detection, nats.
+    /// Evidence of all misses without occlusion before the first detection, nats.
     absence: f64,
     /// Fading sums of the evidence of confidences, nats, and of their number.
     score: f64,
     weight: f64,
 }
 
-/// Hits and looks of one vehicle at one object over some time.
+/// Hits and observations of one object by one vehicle over some time.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ExistenceStatement {
     pub(super) hits: u32,
@@ -257,7 +258,7 @@ pub(super) struct ExistenceStatement {
 }
 
 impl SensorHistory {
-    /// A vehicle that has not looked yet.
+    /// A vehicle without observations.
     pub(super) fn new(sensor: SensorId, at: Timestamp) -> Self {
         Self {
             sensor,
@@ -277,7 +278,7 @@ impl SensorHistory {
         }
     }
 
-    /// Records a detection. `nats` is the evidence of the result, `confidence_nats` that of its confidence.
+    /// Records a detection. `nats` is the evidence of the result, `confidence_nats` the evidence of the confidence.
     pub(super) fn hit(
         &mut self,
         at: Timestamp,
@@ -297,7 +298,7 @@ impl SensorHistory {
         }
     }
 
-    /// Records a look at the object in view without a detection.
+    /// Records an observation of the object's place without a detection.
     pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
         self.look(at, rates.nats(false));
         self.state = self.state.after(false);
@@ -308,13 +309,13 @@ impl SensorHistory {
         self.unjudged.looks += 1;
     }
 
-    /// Counts a miss at a place that nothing hides as evidence that there never was an object.
+    /// Counts a miss without occlusion as evidence that the object does not exist.
     pub(super) fn deny(&mut self, rates: &LookRates) {
         self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
         self.is_view_known = rates.has_pose;
     }
 
-    /// Fades earlier evidence and counts a look.
+    /// Fades earlier evidence and counts an observation.
     fn look(&mut self, at: Timestamp, nats: f64) {
         let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
         self.score *= kept;
@@ -334,13 +335,13 @@ impl SensorHistory {
         )
     }
 
-    /// Evidence of the vehicle for the object at `at` if it stood alone, nats.
+    /// Evidence of this vehicle alone for the object at `at`, nats.
     pub(super) fn nats(&self, at: Timestamp) -> f64 {
         self.kept(at) * self.sequence + self.confidence_nats(at)
     }
 
-    /// Evidence of the confidences that counts beside the other vehicles', nats: zero unless the last look was a detection,
-    /// because earlier confidences are no evidence that the object is still there.
+    /// Evidence of the confidences that is added to the evidence of other vehicles, nats. Zero unless the last
+    /// observation was a detection, because earlier confidences do not show that the object is still there.
     pub(super) fn shared_confidence_nats(&self, at: Timestamp) -> f64 {
         if self.state.is_hit() {
             CONFIDENCE_WEIGHT * self.confidence_nats(at)
@@ -349,7 +350,7 @@ impl SensorHistory {
         }
     }
 
-    /// Evidence against the object by a vehicle that has its place in view and has not detected it, nats.
+    /// Evidence against the object by a vehicle that has observed its place and has not detected it, nats.
     pub(super) fn denied_nats(&self, at: Timestamp) -> f64 {
         if self.is_view_known && self.last_hit.is_none() {
             self.kept(at) * self.absence

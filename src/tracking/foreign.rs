@@ -1,11 +1,11 @@
-//! Objects of neighbouring cells: they lend identities to tracks, and are judged by what this cell's vehicles see.
+//! Objects of neighbouring cells: they provide identities for tracks, and this cell's vehicles verify them.
 //!
-//! No track is spawned or kept alive by them. A track that begins where such an object is takes over its identity,
-//! velocity, heading, size, time of first detection, existence and class. Its position is that of the
-//! detection. Two cells that found one object apart agree on the identity of the older one. Of two that are about as
-//! old, they take the smaller one.
+//! Neighbours' objects do not spawn or maintain tracks. A track that begins at the position of such an object takes
+//! over its identity, velocity, heading, size, time of first detection, existence and class. The position of the track
+//! is the position of the detection. Two cells that found one object separately use the identity of the older object,
+//! or the smaller identity if both objects are about as old.
 //!
-//! A cell is judged as a vehicle is (`trust`): it states that its objects exist.
+//! A cell is judged like a vehicle (`trust`): it states that its objects exist.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -27,33 +27,33 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{NeighbourObject, PerceivedObject};
 
-/// Minimum existence of an object of which its cell states that it exists.
+/// Minimum existence of an object that counts as stated by its cell.
 const MIN_STATED: f64 = 0.8;
 
-/// Maximum time in seconds since its last detection of an object of which its cell states that it exists.
+/// Maximum time in seconds since the last detection of an object that counts as stated by its cell.
 const MAX_STATED_AGE_S: f64 = 0.5;
 
-/// Standard deviation of a velocity that is taken over, as its value may be wrong: in metres per second, and as a share of
-/// the speed.
+/// Standard deviation of a velocity taken over from another cell, because the value may be wrong: in metres per second,
+/// and as a share of the speed.
 const VELOCITY_SIGMA_MPS: f64 = 2.0;
 const VELOCITY_SIGMA_SHARE: f64 = 0.5;
 
-/// Time in seconds for which objects of two cells move apart by the errors of their clocks.
+/// Time in seconds for which the clock errors of two cells move their objects apart.
 const CLOCK_ERROR_S: f64 = 0.1;
 
 /// Time for which a cell's object and a track agree before the track may take over its identity.
 const AGREES_AFTER: Duration = Duration::from_millis(400);
 
-/// Difference in seconds of the times of first detection below which none is the older.
+/// Minimum difference in seconds between the first detections of an older and a younger object.
 const TIE_S: f64 = 1.0;
 
-/// Time after which the smaller identity holds, if the other cell has not taken over the one of the older track.
+/// Time after which the smaller identity is used, if the other cell has not taken over the identity of the older track.
 const TIES_AFTER: Duration = Duration::from_secs(4);
 
-/// Maximum number of identities that a track takes over from cells one after the other.
+/// Maximum number of identities that a track takes over from cells in succession.
 const MAX_RENAMES: u8 = 2;
 
-/// Objects of neighbouring cells, and the trust in those cells.
+/// Objects of neighbouring cells, and trust in the cells.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForeignObjects {
     objects: Vec<ForeignObject>,
@@ -65,13 +65,13 @@ pub(super) struct ForeignObjects {
 #[derive(Debug, Clone)]
 pub(super) struct ForeignObject {
     cell: NodeName,
-    /// The object as a track; its history is what this cell's vehicles saw there.
+    /// The object as a track; its history has the observations of this cell's vehicles.
     pub(super) track: Track,
     stated: NeighbourObject,
-    /// When its cell's map was fused.
+    /// Time at which the object's cell fused its map.
     fused_at: Timestamp,
     judged_at: Timestamp,
-    /// The track that is the same object, and since when.
+    /// The track of this cell that matches the object, and since when.
     same: Option<(Uuid, Timestamp)>,
 }
 
@@ -98,7 +98,7 @@ impl ForeignObject {
         }
     }
 
-    /// True if its cell states that it exists.
+    /// True if the cell states that the object exists.
     pub(super) fn is_stated(&self) -> bool {
         let object = &self.stated.object;
         object.existence.unwrap_or(object.confidence) >= MIN_STATED
@@ -132,8 +132,8 @@ impl ForeignObject {
 }
 
 impl ForeignObjects {
-    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`. Tracks that are the same
-    /// objects take over the identities of older ones.
+    /// Replaces all objects of neighbouring cells; their ages are relative to `stated_at`. Tracks that match an older
+    /// object take over its identity.
     pub(super) fn take(
         &mut self,
         stated: &[NeighbourObject],
@@ -150,7 +150,7 @@ impl ForeignObjects {
                 let mut object = ForeignObject::new(stated, fused_at, config);
                 let of_cell = || known.iter().filter(|known| known.cell == stated.cell);
                 let by_id = of_cell().find(|known| known.track.id == stated.object.id);
-                // An object that changes its identity all the time is judged nevertheless.
+                // An object whose identity changes in every map is judged nevertheless.
                 let at_place = || {
                     let position = object.track.state.position;
                     of_cell().find(|known| {
@@ -170,7 +170,7 @@ impl ForeignObjects {
         self.agree(tracks, stated_at, fleet);
     }
 
-    /// Forgets objects whose maps were fused before `limit`, and vehicles that are not `known`.
+    /// Removes objects whose maps were fused before `limit`, and vehicles for which `known` returns false.
     pub(super) fn forget(&mut self, limit: Timestamp, known: impl Fn(SensorId) -> bool) {
         self.objects.retain(|object| object.fused_at >= limit);
         self.objects
@@ -178,7 +178,7 @@ impl ForeignObjects {
             .for_each(|object| object.track.history.retain(&known));
     }
 
-    /// Finds the track that is the same as each object: of each cell one to one, the nearest first.
+    /// Finds the track that matches each object: one to one within a cell, the nearest first.
     fn compare(&mut self, tracks: &TrackStore, now: Timestamp, config: &TracksConfig) {
         let ids: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
         let mut pairs = Vec::new();
@@ -252,7 +252,7 @@ impl ForeignObjects {
         }
     }
 
-    /// True if an object is not shown: it is one of this cell's, or its cell is not believed.
+    /// True if an object is not published, because it matches a track of this cell or its cell is distrusted.
     pub(super) fn hides(&self, stated: &NeighbourObject, fleet: &Fleet) -> bool {
         let is_this = |object: &&ForeignObject| {
             object.track.id == stated.object.id && object.cell == stated.cell
@@ -265,7 +265,7 @@ impl ForeignObjects {
         is_same || !self.is_trusted(&stated.cell, fleet)
     }
 
-    /// Weight of what a cell states, 0 to 1.
+    /// Weight of a cell's statements, 0 to 1.
     pub(super) fn trust(&self, cell: &NodeName, fleet: &Fleet) -> f64 {
         self.trust.of(cell).trust(fleet.reputation())
     }
@@ -274,8 +274,8 @@ impl ForeignObjects {
         self.trust(cell, fleet) > 0.0
     }
 
-    /// The objects of which their cells state that they exist, and whose place at `at` is looked at; so many of each cell at most.
-    /// Their histories are what this cell's vehicles saw there.
+    /// The objects that their cells state as existing and whose position at `at` is observed, at most `max_each` per
+    /// cell. Their histories have the observations of this cell's vehicles.
     pub(super) fn stated(
         &mut self,
         max_each: usize,
@@ -294,7 +294,7 @@ impl ForeignObjects {
         looked_at.map(|object| &mut object.track)
     }
 
-    /// True if there is none.
+    /// True if no neighbouring cell has an object.
     pub(super) fn is_empty(&self) -> bool {
         self.objects.is_empty()
     }
@@ -316,7 +316,7 @@ impl ForeignObjects {
         }
     }
 
-    /// The object of a trusted cell that a new track at `measurement` is, if there is one that no track is yet.
+    /// The object of a trusted cell that a new track at `measurement` continues, if no track continues the object yet.
     pub(super) fn find(
         &self,
         at: Timestamp,
@@ -335,8 +335,8 @@ impl ForeignObjects {
             (is_near && detected.is_none_or(is_like))
                 .then_some((innovation.distance_squared, object))
         });
-        // A cell that is not believed, or copies identities, must not stand before others. One that is not proven lends only
-        // what it can be judged by.
+        // A distrusted cell, or a cell that copies identities, must not take precedence over other cells. From an unproven
+        // cell only objects that this cell can verify are used.
         let usable = near.filter(|(_, object)| {
             let trust = self.trust.of(&object.cell);
             let is_believed = trust.trust(fleet.reputation()) > 0.0;

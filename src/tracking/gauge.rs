@@ -1,11 +1,10 @@
 //! Gauge of the registration: a shift, a rotation and a delay that the errors of all observers have in common.
 //!
-//! Observers find their errors relative to each other. A motion of all together changes no residual, so nothing but
-//! unequal gains decides on it, and it would wander without end. Therefore a round leaves the common motion of
-//! observers that correspond, directly or through others, as it was. It only fades with the mean of the errors: those of
-//! observers that leave or join do not move the map at once. If each faded by itself, those that last would take over
-//! the errors of those that fade. What a group has in common is the [`Consensus`] of most observers: the errors of a minority
-//! do not count as common.
+//! Observers estimate their errors relative to each other. A motion common to all observers changes no residual and would
+//! drift because of unequal gains. A round therefore keeps the mean error of each connected group (observers that
+//! correspond, directly or through others) and lets only this mean decay, so that an observer that joins or leaves does
+//! not shift the map at once. If each error decayed separately, the remaining observers would take over the errors of the
+//! others. The mean of a group is the [`Consensus`] of most observers, which excludes the errors of a minority.
 
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
@@ -18,7 +17,7 @@ use super::sensors::{SensorModel, Sensors};
 pub(super) struct Gauge {
     /// By sensor: the next one towards the representative of its group.
     towards: Vec<usize>,
-    /// By sensor that reported: its error before, and the part of an error that is left after that time.
+    /// By sensor that reported: its error before the round, and the part of an error that remains after decay.
     before: Vec<Option<(Vector4<f64>, f64)>>,
 }
 
@@ -30,19 +29,19 @@ impl Gauge {
         self.towards[one] = other;
     }
 
-    /// Notes an observer's error before it is estimated anew, and the part of it that is left after that time.
+    /// Records an observer's error before the estimate is updated, and the part of it that remains after decay.
     pub(super) fn note(&mut self, sensor: SensorId, error: Vector4<f64>, kept: f64) {
         self.group(sensor.number());
         self.before[sensor.number()].get_or_insert((error, 1.0)).1 *= kept;
     }
 
-    /// Takes the common motion of each group back.
+    /// Removes the change of the common motion of each group.
     pub(super) fn hold(mut self, sensors: &mut Sensors, prior: &BiasPrior) {
         let known = self.towards.len();
         let observers = || sensors.iter().filter(|sensor| sensor.id.number() < known);
         let weight =
             |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.pose_bias.weight(prior);
-        // Those that were silent have not faded yet.
+        // The errors of observers without a report have not decayed yet.
         let before = |before: &[Option<(Vector4<f64>, f64)>], sensor: &SensorModel| {
             before[sensor.id.number()].unwrap_or((sensor.pose_bias.error(), 1.0))
         };
@@ -86,7 +85,7 @@ impl Gauge {
         }
     }
 
-    /// The representative of an observer's group. Halves the way to it.
+    /// The representative of an observer's group. Halves the path to it.
     fn group(&mut self, mut sensor: usize) -> usize {
         let known = self.towards.len();
         if sensor >= known {
@@ -106,12 +105,12 @@ impl Gauge {
 struct GroupMember {
     sensor: SensorId,
     pivot: Vector2<f64>,
-    /// Its error before the round, faded, and after it.
+    /// Error before the round, decayed, and after the round.
     before: Vector4<f64>,
     after: Vector4<f64>,
-    /// Weight among those that decide what most have in common: vehicles that stand have no more of it than others.
+    /// Weight in the choice of the majority; standing vehicles have no higher weight here.
     trust: f64,
-    /// Weight in what they have in common.
+    /// Weight in the estimate of the common motion.
     weight: f64,
 }
 
@@ -124,7 +123,7 @@ struct Motion {
     delay_s: f64,
 }
 
-/// What most observers of a group have in common.
+/// The common motion of most observers of a group.
 #[derive(Debug)]
 struct Consensus {
     motion: Motion,
@@ -133,7 +132,7 @@ struct Consensus {
 }
 
 impl Consensus {
-    /// Minimum number of observers among which there is a majority.
+    /// Minimum number of observers for a majority.
     const MIN_MEMBERS: usize = 3;
 
     /// Number of reweighting steps.
@@ -212,7 +211,7 @@ fn deviation(median: f64, residuals: usize) -> f64 {
 }
 
 impl Motion {
-    /// What this motion adds to an earlier one about the same place.
+    /// The change from an earlier motion to this motion about the same point.
     fn less(&self, before: &Self) -> Self {
         Self {
             about: self.about,
@@ -222,7 +221,7 @@ impl Motion {
         }
     }
 
-    /// Its part of the error of an observer: offset, rotation and delay.
+    /// The part of this motion in the error of an observer: offset, rotation and delay.
     fn at(&self, pivot: &Vector2<f64>) -> Vector4<f64> {
         let offset = self.shift + quarter_turn(&(pivot - self.about)) * self.rotation_rad;
         Vector4::new(offset.x, offset.y, self.rotation_rad, self.delay_s)
@@ -274,7 +273,7 @@ impl MotionSums {
     }
 }
 
-/// The residual up to which the members have half of the trust.
+/// Median of the residuals, weighted by the trust in the members.
 fn weighted_median(members: &[GroupMember], residuals: &[f64]) -> f64 {
     let mut sorted: Vec<(f64, f64)> = residuals
         .iter()

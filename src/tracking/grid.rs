@@ -13,7 +13,7 @@ pub(super) struct TrackGrid {
     cells: HashMap<(i32, i32), SmallVec<[IndexedTrack; 4]>>,
 }
 
-/// A track as it was when the grid was built.
+/// A track at the time at which the grid was built.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct IndexedTrack {
     /// Position at the time of the grid, metres.
@@ -86,7 +86,7 @@ impl TrackGrid {
         }
     }
 
-    /// Number of the row or column of cells that a coordinate lies in.
+    /// Number of the row or column of cells that contains a coordinate.
     fn line(&self, coordinate_m: f64) -> i32 {
         let cells = coordinate_m / self.cell_m;
         // The result of `floor`, which is a function call on processors without an instruction for it.

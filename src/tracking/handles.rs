@@ -1,6 +1,6 @@
-//! Handles: small numbers that stand for a vehicle or a track, for as long as its owner says.
+//! Handles: small numbers that identify a vehicle or a track. Their owner decides how long they are valid.
 
-/// Number of a vehicle that is heard. `Sensors` alone creates it, and frees it for another vehicle when it forgets this one.
+/// Number of a vehicle that reports. Only `Sensors` creates it, and reuses it after it has removed the vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct SensorId(pub(super) u32);
 
@@ -11,7 +11,6 @@ impl SensorId {
     }
 }
 
-/// Position of a track in the store. `TrackStore` alone creates it. Nothing keeps one across `TrackStore::retain`, which
-/// invalidates it.
+/// Position of a track in the store. Only `TrackStore` creates it. `TrackStore::retain` invalidates all handles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct TrackIndex(pub(super) u32);

@@ -3,9 +3,10 @@
 //! White noise acceleration of density q drives the state (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications
 //! to Tracking and Navigation", 2001, section 6.2.2). The covariance is split in two (Julier, Uhlmann, "General
 //! decentralized data fusion with covariance intersection", 2001, section 12.4). The part that is independent from
-//! report to report shrinks with every report, by Joseph's form, which holds for any gain. The common part, such as the
-//! error of a vehicle's pose, never shrinks below that of the best report: errors of standard deviations b₁ and b₂ that
-//! are weighted by k and 1−k have a standard deviation of at most k·b₁ + (1−k)·b₂, whatever their correlation.
+//! report to report shrinks with every report, by Joseph's form, which is valid for any gain. The common part, such as
+//! the error of a vehicle's pose, has the smallest common part of any report as its lower bound: two errors with
+//! standard deviations b₁ and b₂ and weights k and 1−k have a standard deviation of at most k·b₁ + (1−k)·b₂ for any
+//! correlation.
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -38,7 +39,7 @@ pub(super) struct Innovation {
 #[derive(Debug, Clone)]
 pub(super) struct KinematicState {
     pub(super) at: Timestamp,
-    /// How the object may move.
+    /// Motion parameters of the object's class.
     pub(super) class: ObjectClass,
     /// Metres.
     pub(super) position: Vector2<f64>,
@@ -72,7 +73,7 @@ impl KinematicState {
         at.micros_from(self.at) as f64 * 1e-6
     }
 
-    /// The position at `at`, earlier or later.
+    /// The position at `at`, which may be before or after the time of the state.
     pub(super) fn position_at(&self, at: Timestamp) -> Vector2<f64> {
         self.position + self.velocity * self.seconds_to(at)
     }
@@ -95,7 +96,7 @@ impl KinematicState {
             + Matrix2::identity() * drift
     }
 
-    /// Moves the state to `at`; an earlier time changes nothing.
+    /// Moves the state to `at`; an earlier time has no effect.
     pub(super) fn predict(&mut self, at: Timestamp) {
         let dt = self.seconds_to(at);
         let density = self.class.acceleration_density();
@@ -153,7 +154,8 @@ impl KinematicState {
     /// Updates the state with a velocity measured at `at`, not after the state; `sigma_mps` is its standard deviation
     /// in each direction.
     ///
-    /// Errors of successive velocities may be the same. The velocity is therefore never better known than by one.
+    /// Errors of successive velocities may be equal, so the variance of the velocity remains at least the variance of
+    /// one measurement.
     pub(super) fn update_velocity(
         &mut self,
         at: Timestamp,
@@ -166,7 +168,7 @@ impl KinematicState {
         if known <= stated {
             return;
         }
-        // A measurement of this variance leaves the stated one.
+        // A measurement of this variance results in the stated variance.
         let variance = known * stated / (known - stated);
         let noise = self.vv + Matrix2::identity() * variance;
         let Some(inverse) = inverse(&noise) else {
@@ -181,7 +183,7 @@ impl KinematicState {
 
     /// Joseph's form of the covariance update, for any gain.
     ///
-    /// `cross` are the covariances of the state with the measured quantity, `noise` is that of the innovation.
+    /// `cross` is the covariance of the state with the measured quantity, `noise` the covariance of the innovation.
     fn joseph(&mut self, cross: [Matrix2<f64>; 2], gain: [Matrix2<f64>; 2], noise: &Matrix2<f64>) {
         let kept = [0, 1].map(|i| gain[i] * noise - cross[i]);
         let change =
@@ -196,9 +198,9 @@ impl KinematicState {
         self.vv += Matrix2::identity() * (speed_mps * speed_mps);
     }
 
-    /// Adapts the covariance to a manoeuvre: a normalised innovation of `excess` times the expected one means that the
-    /// state is that much less certain (fading memory; Bar-Shalom et al. 2001, section 11.2), and the velocity may have
-    /// changed as much as within a second.
+    /// Adapts the covariance to a manoeuvre: a normalised innovation of `excess` times the expected value scales the
+    /// covariance of the state by that factor (fading memory; Bar-Shalom et al. 2001, section 11.2) and adds the
+    /// variance of the class's velocity change within a second.
     pub(super) fn adapt(&mut self, excess: f64) {
         self.pp *= excess;
         self.pv *= excess;

@@ -22,25 +22,26 @@ use crate::wire::{FusedObject, GlobalMap, ObjectReport};
 /// Maximum distance of two tracks of one object, metres.
 pub(super) const MERGE_M: f64 = 2.0;
 
-/// The same in metres if their labels differ: people get in and out of cars, and stand beside each other.
+/// Maximum distance of two tracks of one object with different labels, metres: people get in and out of cars, and stand
+/// next to each other.
 const MERGE_UNLIKE_M: f64 = 1.0;
 
-/// Maximum number of later tracks that are compared with each.
+/// Maximum number of later tracks that are compared with each track.
 const MAX_NEAR_EACH: usize = 32;
 
-/// The same in standard deviations.
+/// Maximum distance of two tracks of one object in standard deviations.
 const MERGE_SIGMAS: f64 = 3.0;
 
 /// Probability of a detection by a vehicle whose view is unknown.
 const UNKNOWN_RATE: f64 = 0.9;
 
-/// Time for which a silent vehicle is remembered after its last object.
+/// Time for which a silent vehicle is kept after its last object.
 const REMEMBERED: Duration = Duration::from_secs(10);
 
-/// Maximum existence at which a track that was never confirmed ends.
+/// Maximum existence at which an unconfirmed track ends.
 const MIN_EXISTENCE: f64 = 0.005;
 
-/// Merges tracks of one object; the older one stays.
+/// Merges tracks of one object; the older track remains.
 pub(super) fn merge(
     tracks: &mut TrackStore,
     sensors: &Sensors,
@@ -103,7 +104,8 @@ fn may_be_one(track: &Track, other: &Track, now: Timestamp, config: &TracksConfi
         && distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
 }
 
-/// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than any track lives.
+/// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than a track can
+/// last.
 pub(super) fn prune(
     tracks: &mut TrackStore,
     sensors: &mut Sensors,
@@ -133,8 +135,8 @@ pub(super) fn prune(
     }
 }
 
-/// Takes over the objects of another aggregator's map, received at `now`: the identities of known objects, and unknown
-/// objects as tracks whose existence fades.
+/// Takes over the objects of another aggregator's map, received at `now`: identities for existing tracks, and new
+/// tracks, whose existence fades, for the other objects.
 pub(super) fn adopt_map(
     tracks: &mut TrackStore,
     map: &GlobalMap,

@@ -1,14 +1,14 @@
-//! Occlusion map of one frame: the directions in which a detection hides what is behind it.
+//! Occlusion map of one frame: the directions in which a detection hides objects behind it.
 
 use nalgebra::Vector2;
 
 use super::coverage::turn;
 use crate::wire::PerceivedObject;
 
-/// Distance of the nearest detection in each direction, seen from the vehicle.
+/// Distance of the nearest detection in each direction from the vehicle.
 #[derive(Debug)]
 pub(super) struct OcclusionMap {
-    /// Position of the vehicle; where it is unknown, nothing is hidden.
+    /// Position of the vehicle; without a position, no place is hidden.
     origin: Option<Vector2<f64>>,
     /// Line of sight by direction, metres.
     sight_m: [f32; Self::RAYS],
@@ -20,7 +20,7 @@ impl OcclusionMap {
     /// Half the width of an occluder, metres.
     const HALF_WIDTH_M: f64 = 0.6;
 
-    /// Minimum distance in metres of a hidden object behind its occluder; what is nearer may be the same object.
+    /// Minimum distance in metres of a hidden object behind its occluder; a nearer object may be the occluder itself.
     const MIN_BEHIND_M: f64 = 3.0;
 
     /// A frame without detections, seen from `origin`.
@@ -31,7 +31,8 @@ impl OcclusionMap {
         }
     }
 
-    /// Adds a detection as an occluder, unless it is nearer than `min_m`: a part of the vehicle itself.
+    /// Adds a detection as an occluder, unless its distance is below `min_m`, because it is then a part of the vehicle
+    /// itself.
     pub(super) fn add(&mut self, object: &PerceivedObject, min_m: f64) {
         let Some(origin) = self.origin else { return };
         let offset = Vector2::new(object.x_m, object.y_m) - origin;

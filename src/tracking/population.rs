@@ -1,11 +1,11 @@
 //! Births and departures of objects, estimated from the tracks.
 
-/// Share of the tracks that one vehicle begins that become objects.
+/// Share of the tracks begun by one vehicle that become objects.
 #[derive(Debug, Clone)]
 pub(super) struct Births {
     /// Tracks that became objects.
     objects: f64,
-    /// Tracks that ended before.
+    /// Tracks that ended before they became objects.
     clutter: f64,
 }
 
@@ -25,7 +25,7 @@ impl Births {
     /// Number of births as which the usual share counts.
     const USUAL: f64 = 4.0;
 
-    /// Number of births beyond which earlier ones are discounted.
+    /// Number of births beyond which earlier births are discounted.
     const MAX: f64 = 400.0;
 
     /// Log-odds that a new track is an object.
@@ -33,7 +33,7 @@ impl Births {
         (self.objects / self.clutter).ln().clamp(-4.0, 3.0)
     }
 
-    /// Counts a track that turned out to be an object, or clutter.
+    /// Counts a new track that became an object or turned out to be clutter.
     pub(super) fn settle(&mut self, is_object: bool) {
         if is_object {
             self.objects += 1.0;
@@ -46,7 +46,7 @@ impl Births {
     }
 }
 
-/// How long objects stay in the cell.
+/// The time for which objects stay in the cell.
 #[derive(Debug, Clone)]
 pub(super) struct Population {
     /// Objects that left.
@@ -79,7 +79,7 @@ impl Population {
         self.departures / self.stayed_s
     }
 
-    /// Counts the seconds for which objects stayed, added up.
+    /// Counts seconds for which objects stayed, summed over objects.
     pub(super) fn stay(&mut self, seconds: f64) {
         self.stayed_s += seconds;
         let kept = (Self::MAX_TIME_S / self.stayed_s).min(1.0);

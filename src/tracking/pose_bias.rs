@@ -1,12 +1,13 @@
 //! Pose bias of one vehicle: the offset and the rotation of its pose, and the delay of its stamps.
 //!
-//! The biases are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. Every report is
-//! one step of an extended Kalman filter in information form over all correspondences. It is reweighted against wrong ones
-//! by Cauchy's function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
+//! The biases are a Gauss-Markov process of four states with a slow change and a given spread at rest. Every report is
+//! one step of an extended Kalman filter in information form over all correspondences. Cauchy's function reweights the
+//! correspondences against wrong pairs (Holland, Welsch, "Robust regression using iteratively reweighted
+//! least-squares", 1977).
 //!
-//! The delay tells the directions of traffic apart: it shifts oncoming objects and overtaking ones in opposite
-//! directions. Without it, two vehicles that each see one direction would take their delays for offsets and pull each
-//! other along without end.
+//! The delay is observable from the directions of traffic: it shifts oncoming objects and overtaking objects in
+//! opposite directions. Without the delay, two vehicles that each observe one direction would estimate offsets instead,
+//! and their corrections would drift together without bound.
 
 use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
 
@@ -23,13 +24,13 @@ const CAUCHY: f64 = 2.0;
 /// Maximum delay, in standard deviations.
 const MAX_DELAY: f64 = 3.0;
 
-/// Time in seconds after which a vehicle that states the same pose is known to stand.
+/// Time in seconds after which a vehicle that repeats one pose counts as standing.
 const STANDS_S: f64 = 1.0;
 
-/// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
+/// Maximum weight of a standing vehicle, as a multiple of the weight of a moving vehicle.
 const MAX_WEIGHT: f64 = 100.0;
 
-/// Time in seconds for which a vehicle sees an object from the same side.
+/// Time in seconds for which a vehicle observes an object from one side.
 const SAME_SIDE_S: f64 = 10.0;
 
 /// Minimum number of correspondences of a published correction.
@@ -57,7 +58,7 @@ impl BiasPrior {
     }
 }
 
-/// A reported position and the position at which others detected the same object.
+/// A reported position and the position at which other vehicles detected the object.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Correspondence {
     pub(super) reported: Vector2<f64>,
@@ -68,7 +69,8 @@ pub(super) struct Correspondence {
     pub(super) variance: f64,
     /// Variance of the error that the references may share, m².
     pub(super) common: f64,
-    /// Variance of what the vehicle is wrong about this object for as long as it sees it from the same side, m².
+    /// Variance of the vehicle's error about this object, which is constant while the vehicle observes the object from
+    /// one side, m².
     pub(super) of_object: f64,
 }
 
@@ -83,9 +85,9 @@ pub(super) struct PoseBias {
     covariance: Matrix4<f64>,
     /// Fading number of correspondences.
     pairs: f64,
-    /// Time for which the vehicle has stood where it says, seconds.
+    /// Time for which the vehicle has stood still, seconds.
     stood_s: f64,
-    /// How well the errors agree with those of most others, 0 to 1.
+    /// How well the errors agree with the errors of most other vehicles, 0 to 1.
     consistency: f64,
 }
 
@@ -103,12 +105,12 @@ impl PoseBias {
         }
     }
 
-    /// Sets the centre of the rotation; the bias goes with the vehicle.
+    /// Sets the centre of the rotation, which moves with the vehicle; the bias is kept.
     pub(super) fn set_pivot(&mut self, pivot: Vector2<f64>) {
         self.pivot = pivot;
     }
 
-    /// Notes that the vehicle has stood still for another `passed_s`, or that it moves.
+    /// Records that the vehicle has stood still for another `passed_s`, or that it moves.
     pub(super) fn stand(&mut self, passed_s: Option<f64>) {
         self.stood_s = passed_s.map_or(0.0, |passed_s| self.stood_s + passed_s);
     }
@@ -123,23 +125,23 @@ impl PoseBias {
         self.pivot
     }
 
-    /// Weight in what all have in common: the longer an error lasts, the more is known of it.
+    /// Weight in the common motion of all vehicles, which grows while the vehicle stands.
     pub(super) fn weight(&self, prior: &BiasPrior) -> f64 {
         (1.0 + self.stood_s / prior.memory_s).min(MAX_WEIGHT)
     }
 
-    /// How well the errors agree with those of most vehicles that see the same objects: 1 as well as theirs with each other,
-    /// 0 if they are far from them. It returns to 1 as the errors fade.
+    /// How well the errors agree with the errors of most vehicles that detect common objects: 1 within their spread, 0
+    /// far from it. The value returns to 1 as the errors decay.
     pub(super) fn consistency(&self) -> f64 {
         self.consistency
     }
 
-    /// Sets how well the errors agree with those of most others.
+    /// Sets how well the errors agree with the errors of most other vehicles.
     pub(super) fn set_consistency(&mut self, consistency: f64) {
         self.consistency = consistency;
     }
 
-    /// Takes back a part of the error that the vehicle shares with others.
+    /// Subtracts a part of the error that the vehicle shares with other vehicles.
     pub(super) fn take_back(&mut self, common: &Vector4<f64>, prior: &BiasPrior) {
         self.error -= common;
         self.limit_delay(prior);
@@ -167,11 +169,12 @@ impl PoseBias {
         Rotation2::new(self.error.z)
     }
 
-    /// Delay of the vehicle's stamps, seconds: the estimate if its marginal likelihood is greater than that of no delay.
+    /// Delay of the vehicle's stamps, seconds: the estimate if its marginal likelihood is greater than the likelihood
+    /// without delay.
     ///
-    /// The ratio of the two is that of the densities of no delay before and after the observations (Dickey, "The weighted
-    /// likelihood ratio, linear hypotheses on normal location parameters", 1971). An estimate of little more than noise
-    /// would move reports that were captured together apart.
+    /// The likelihood ratio equals the ratio of the densities of zero delay before and after the observations (Dickey,
+    /// "The weighted likelihood ratio, linear hypotheses on normal location parameters", 1971). An estimate that is
+    /// mostly noise would separate reports that were captured together.
     pub(super) fn delay_s(&self, prior: &BiasPrior) -> f64 {
         let before = prior.delay_s * prior.delay_s;
         let after = self.covariance.m44;
@@ -187,8 +190,8 @@ impl PoseBias {
         (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
     }
 
-    /// Updates the estimate; returns the part of the error before that was left at `at`. The references hold for `at`,
-    /// which is the report's stamp less `delay_s`.
+    /// Updates the estimate; returns the part of the former error that remained at `at`. The references are valid for
+    /// `at`, which is the report's stamp less `delay_s`.
     pub(super) fn observe(
         &mut self,
         at: Timestamp,
@@ -202,8 +205,8 @@ impl PoseBias {
         kept
     }
 
-    /// Updates the estimate; an object is seen from the same side in so many `frames`, which together say no more of its
-    /// own error than one.
+    /// Updates the estimate. An object is observed from one side in `frames` frames, which together count as one
+    /// measurement of its own error.
     fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], frames: f64, prior: &BiasPrior) {
         let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty())
         else {
@@ -223,7 +226,7 @@ impl PoseBias {
                 let variance = pair.variance + pair.of_object;
                 let squared = residual.norm_squared() / (variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
-                // More references do not reduce the error that they share.
+                // The error that the references share remains with any number of references.
                 let variance = pair.variance + frames * pair.of_object;
                 let weight = trust / (variance + pair.common * pairs.len() as f64);
                 normal.add(
@@ -252,7 +255,8 @@ impl PoseBias {
         self.error.w = self.error.w.clamp(-max_s, max_s);
     }
 
-    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior. Returns the part that is left.
+    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior. Returns the part that
+    /// remains.
     fn fade(&mut self, at: Timestamp, prior: &BiasPrior) -> f64 {
         let stood = 1.0 + self.stood_s / STANDS_S;
         let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();

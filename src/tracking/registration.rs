@@ -1,6 +1,6 @@
-//! Registration: pose biases of vehicles, estimated from objects that others detect too.
+//! Registration: pose biases of vehicles, estimated from objects that other vehicles detect too.
 //!
-//! An error that all vehicles share is not observable; no update changes it ([`Gauge`]), and it decays.
+//! An error that all vehicles share is not observable. Updates do not change this error ([`Gauge`]), and it decays.
 
 use std::time::Duration;
 
@@ -14,17 +14,17 @@ use super::sensors::Sensors;
 use super::store::TrackStore;
 use crate::model::time::Timestamp;
 
-/// Maximum time between two detections of an object that correspond.
+/// Maximum time between two corresponding detections of an object.
 const SIMULTANEOUS: Duration = Duration::from_millis(300);
 
-/// Detections of one report that others may correspond to.
+/// Detections of one report, for correspondences with other vehicles.
 #[derive(Debug)]
 pub(super) struct RegistrationFrame {
     pub(super) sensor: SensorId,
     /// Time of capture: the stamp less `delay_s`, the estimate at that time.
     pub(super) at: Timestamp,
     pub(super) delay_s: f64,
-    /// True if the vehicle has jumped to another place: its earlier frames are void.
+    /// True if the vehicle has jumped to another place, which invalidates its earlier frames.
     pub(super) has_jumped: bool,
     pub(super) samples: Vec<RegistrationSample>,
 }
@@ -71,7 +71,7 @@ pub(super) fn register(
 }
 
 impl Correspondence {
-    /// Compares a detection with the mean of the others' positions, weighted by trust.
+    /// Compares a detection with the mean of the other vehicles' positions, weighted by trust.
     fn of(
         sample: &RegistrationSample,
         frame: &RegistrationFrame,

@@ -11,7 +11,7 @@ use super::occlusion::OcclusionMap;
 use super::sensors::SensorModel;
 use crate::wire::{ObjectReport, PerceivedObject};
 
-/// Minimum weight of a vehicle's positions, by which their covariances are divided.
+/// Minimum weight of a vehicle's positions. The covariances of the positions are divided by the weight.
 const MIN_WEIGHT: f64 = 0.05;
 
 /// A detection of a report, corrected by the estimated pose bias.
@@ -39,10 +39,11 @@ pub(super) struct Scan<'a> {
     pub(super) trust: f64,
     /// Correction of the report's stamp, seconds.
     pub(super) delay_s: f64,
-    /// True if the vehicle has jumped to another place, so that its earlier samples are void.
+    /// True if the vehicle has jumped to another place, which invalidates its earlier samples.
     pub(super) has_jumped: bool,
     pub(super) detections: Vec<ScannedDetection<'a>>,
-    /// Directions that the detections hide. A hidden miss is no statement of the vehicle; existences use the rates alone.
+    /// Directions that the detections hide. A hidden miss is not a statement of the vehicle; existences use only the
+    /// rates.
     pub(super) occlusion: OcclusionMap,
 }
 
@@ -96,7 +97,7 @@ impl<'a> Scan<'a> {
         }
     }
 
-    /// Whether the report changes tracks. The statements of a vehicle without trust are judged and have no other effect.
+    /// Whether the report changes tracks. Statements of a distrusted vehicle are judged and have no other effect.
     pub(super) fn is_trusted(&self) -> bool {
         self.trust > 0.0
     }

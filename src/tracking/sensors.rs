@@ -19,24 +19,25 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{ObjectReport, PerceivedObject, WirePose};
 
-/// Distance of a vehicle from where it was, as a share of its range, up to which it stays. Without a pose, it is that of the
-/// median of its detections.
+/// Maximum distance of a standing vehicle from its earlier position, as a share of its range. Without a pose, the
+/// position is the median of its detections.
 const STAYS: f64 = 0.25;
-/// The same of the detections of a vehicle that declares to stand: they come and go.
+/// Maximum distance of the median for a vehicle that declares to stand, because its detections appear and disappear.
 const DECLARED_STAYS: f64 = 1.0;
-/// Range in metres that counts at least: that of a vehicle that detects nothing shrinks.
+/// Lower bound of the range in this comparison, metres, because the range shrinks without detections.
 const MIN_RANGE_M: f64 = 10.0;
 
-/// Time after which a vehicle that states no pose and stays is known to stand.
+/// Time after which a vehicle without a pose whose detections stay in place counts as standing.
 const STAYS_FOR: Duration = Duration::from_secs(120);
 
-/// Consistency of a vehicle's errors with those of most others below which the places that it states are judged.
+/// The positions that a vehicle reports are judged if the consistency of its pose errors with the errors of most other
+/// vehicles is below this value.
 const MIN_CONSISTENCY: f64 = 0.1;
 
 /// Normalised squared error, of two dimensions, that 1 % of the places exceed.
 const CERTAIN_SQUARED: f64 = 9.21;
 
-/// Models of the vehicles that are heard, and the trust in all.
+/// Models of all vehicles that report, and their trust.
 #[derive(Debug, Clone)]
 pub(super) struct Sensors {
     models: Vec<Option<Box<SensorModel>>>,
@@ -46,7 +47,7 @@ pub(super) struct Sensors {
 }
 
 impl Sensors {
-    /// No vehicles.
+    /// A store without vehicles.
     pub(super) fn new(reputation: ReputationConfig) -> Self {
         Self {
             models: Vec::new(),
@@ -56,7 +57,7 @@ impl Sensors {
         }
     }
 
-    /// The model of a vehicle that reports, created if it is new, and the trust in all.
+    /// The model of a reporting vehicle, created for a new vehicle, and the fleet.
     pub(super) fn hear(
         &mut self,
         node: &NodeName,
@@ -84,39 +85,39 @@ impl Sensors {
         (model, &mut self.fleet)
     }
 
-    /// The model of a vehicle that is heard.
+    /// The model of a reporting vehicle.
     pub(super) fn get(&self, id: SensorId) -> Option<&SensorModel> {
         self.models.get(id.number())?.as_deref()
     }
 
-    /// The same, mutable.
+    /// The model of a reporting vehicle, mutable.
     pub(super) fn get_mut(&mut self, id: SensorId) -> Option<&mut SensorModel> {
         self.models.get_mut(id.number())?.as_deref_mut()
     }
 
-    /// The model of a vehicle that is heard, mutable, and the trust in all.
+    /// The model of a reporting vehicle, mutable, and the fleet.
     pub(super) fn with_fleet(&mut self, id: SensorId) -> Option<(&mut SensorModel, &mut Fleet)> {
         let model = self.models.get_mut(id.number())?.as_deref_mut()?;
         Some((model, &mut self.fleet))
     }
 
-    /// The model of a vehicle that is heard, by name.
+    /// The model of a reporting vehicle, by name.
     pub(super) fn by_name(&self, node: &NodeName) -> Option<&SensorModel> {
         self.get(*self.ids.get(node)?)
     }
 
-    /// The models of all vehicles that are heard.
+    /// The models of all reporting vehicles.
     pub(super) fn iter(&self) -> impl Iterator<Item = &SensorModel> {
         self.models.iter().flatten().map(Box::as_ref)
     }
 
-    /// The same, mutable.
+    /// The models of all reporting vehicles, mutable.
     pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut SensorModel> {
         self.models.iter_mut().flatten().map(Box::as_mut)
     }
 
-    /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
-    /// it have none.
+    /// Adopts the counts of all vehicles from a ledger, limited to its latest votes. Vehicles missing in the ledger start
+    /// without counts.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
         let config = self.fleet.reputation();
         let votes = ledger
@@ -137,7 +138,7 @@ impl Sensors {
         self.dormant.keep(votes);
     }
 
-    /// Counts evidence about vehicles that are heard.
+    /// Counts evidence about reporting vehicles.
     pub(super) fn learn(&mut self, evidence: &[Evidence]) {
         for Evidence { node, correct, .. } in evidence {
             if let Some(sensor) = self
@@ -150,7 +151,7 @@ impl Sensors {
         }
     }
 
-    /// Counts what became of a track that a vehicle began.
+    /// Counts whether a track that a vehicle began became an object.
     pub(super) fn settle(&mut self, spawned_by: Option<SensorId>, is_object: bool) {
         if let Some(sensor) = spawned_by.and_then(|vehicle| self.get_mut(vehicle)) {
             sensor.births.settle(is_object);
@@ -164,7 +165,7 @@ impl Sensors {
         }
     }
 
-    /// Forgets the vehicles whose last report is before `limit`, but for their counts; true if there were any.
+    /// Removes the vehicles whose last report is before `limit`, and keeps their counts; true if a vehicle was removed.
     pub(super) fn forget_silent(&mut self, limit: Timestamp) -> bool {
         let is_silent = |model: &mut Box<SensorModel>| model.last_report < limit;
         let mut silent = Vec::new();
@@ -190,7 +191,7 @@ pub(super) struct SensorModel {
     pub(super) node: NodeName,
     last_report: Timestamp,
     pose: Option<WirePose>,
-    /// Place about which the median of its detections stays, metres, and since when.
+    /// Position about which the median of the vehicle's detections stays, metres, and since when.
     place: (Vector2<f64>, Timestamp),
     pub(super) pose_bias: PoseBias,
     pub(super) noise: NoiseModel,
@@ -225,7 +226,7 @@ impl SensorModel {
         }
     }
 
-    /// Rates at a look at a reported position in this state; `None` outside the field of view.
+    /// Rates at an observation of a reported position in this state; `None` outside the field of view.
     pub(super) fn look_rates(
         &self,
         reported: &Vector2<f64>,
@@ -251,8 +252,8 @@ impl SensorModel {
         }
     }
 
-    /// True if the vehicle places an object wrongly by more than it states, while its errors are far from those of most
-    /// others.
+    /// True if a reported position is wrong by more than the vehicle states, and the vehicle's pose errors disagree
+    /// with the errors of most other vehicles.
     pub(super) fn shifts(&self, object: &PerceivedObject, config: &TracksConfig) -> bool {
         let Some(stated) = object.covariance() else {
             return false;
@@ -291,9 +292,9 @@ impl SensorModel {
         has_jumped
     }
 
-    /// True if the vehicle is known to be where it was at the report before. It declares that it does not move, as long as
-    /// that agrees with its places. Or it states the same pose: estimates of one that drives, and even waits, differ from
-    /// report to report. Or, without a pose, its detections stay about a place for longer than any signal is red.
+    /// True if the vehicle stands. It declares that it does not move, and its positions agree with this. Or it repeats
+    /// one pose: estimates of a moving or waiting vehicle differ from report to report. Or it has no pose, and its
+    /// detections have stayed about one position for longer than any red traffic light.
     fn stands(&mut self, report: &ObjectReport, at: Timestamp) -> bool {
         let (place, since) = self.place;
         let centre = self.coverage.centre().unwrap_or(place);
@@ -316,8 +317,8 @@ impl SensorModel {
 
 /// Noise of a vehicle's positions, estimated by distance along and across the line of sight.
 ///
-/// Reported covariances are scaled: the model learns the ratio of the squared residuals to them. Without, it learns the
-/// variances themselves, from a prior that grows with the distance.
+/// Reported covariances are scaled by an estimate: the ratio of the squared residuals to the reported covariance.
+/// Without reported covariances, the variances themselves are estimated, from a prior that grows with the distance.
 #[derive(Debug, Clone, Default)]
 pub(super) struct NoiseModel {
     scale: Learnt,
@@ -339,11 +340,11 @@ struct Learnt {
 }
 
 impl Learnt {
-    /// Number of values as which a prior counts, and beyond which older values are forgotten.
+    /// Number of values as which a prior counts, and beyond which older values are discounted.
     const PRIOR: f64 = 30.0;
     const MEMORY: f64 = 500.0;
 
-    /// The mean beside a prior.
+    /// The mean of the values and a prior.
     fn mean(&self, prior: f64) -> f64 {
         (prior * Self::PRIOR + self.sum) / (Self::PRIOR + self.count)
     }
@@ -362,7 +363,7 @@ impl Learnt {
 pub(super) struct Residual {
     /// Measured less estimated position, metres.
     pub(super) offset: Vector2<f64>,
-    /// Variance of the estimate in each direction, m²: positive if the detection took part in it.
+    /// Variance of the estimate in each direction, m²: positive if the detection contributed to the estimate.
     pub(super) variance: f64,
 }
 
@@ -375,7 +376,7 @@ impl NoiseModel {
     const PER_METRE: f64 = 0.012;
     const ACROSS: f64 = 0.5;
 
-    /// Maximum ratio of a squared residual to the present variance that is estimated from.
+    /// Maximum ratio of a squared residual to the present variance for a residual to be used.
     const MAX_RATIO: f64 = 16.0;
 
     /// Variances along and across the line of sight at a distance, m².
@@ -415,7 +416,7 @@ impl NoiseModel {
         Matrix2::identity() * across + sight * sight.transpose() * (along - across) + floor
     }
 
-    /// Updates the noise by the residual of a detection of a certain track.
+    /// Updates the noise with the residual of a detection of a certain track.
     pub(super) fn learn(
         &mut self,
         object: &PerceivedObject,

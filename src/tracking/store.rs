@@ -18,7 +18,7 @@ pub(super) struct TrackStore {
     grid: TrackGrid,
     /// Time of the grid's positions.
     indexed_at: Timestamp,
-    /// Speed of the fastest track since then, m/s.
+    /// Speed of the fastest track since the time of the grid, m/s.
     fastest_mps: f64,
     /// The track of each vehicle that reports its pose.
     of_vehicle: HashMap<SensorId, TrackIndex>,
@@ -27,7 +27,7 @@ pub(super) struct TrackStore {
     max_tracks: usize,
     max_density: usize,
     gate_m: f64,
-    /// Tracks that were refused for want of room.
+    /// Number of tracks that were refused because the store was full.
     pub(super) refused: u64,
 }
 
@@ -35,7 +35,7 @@ pub(super) struct TrackStore {
 /// look-ups.
 const MIN_CELL_M: f64 = 24.0;
 
-/// Number of shares of the room for tracks. The unconfirmed tracks of one vehicle take at most one share.
+/// The store has this many shares. The unconfirmed tracks of one vehicle use at most one share.
 const SHARES: usize = 4;
 
 impl TrackStore {
@@ -61,7 +61,7 @@ impl TrackStore {
         }
     }
 
-    /// Goes on with other limits. Tracks stay, also more than there is room for.
+    /// Changes the limits. Tracks above a lower limit are kept.
     pub(super) fn configure(&mut self, config: &TracksConfig) {
         let Self {
             max_tracks,
@@ -87,7 +87,7 @@ impl TrackStore {
         self.tracks.iter()
     }
 
-    /// The same, mutable; they stay where they are.
+    /// All tracks, mutable. Their indices remain valid.
     pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut Track> {
         self.tracks.iter_mut()
     }
@@ -100,7 +100,7 @@ impl TrackStore {
             .map(|(index, track)| (TrackIndex(index as u32), track))
     }
 
-    /// Adds a track unless there is no room for it.
+    /// Adds a track unless the store is full.
     pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
         let crowd = self.grid.crowd(&track.state.position, self.gate_m);
         let of_spawner = track
@@ -121,7 +121,7 @@ impl TrackStore {
         Some(index)
     }
 
-    /// Indexes all tracks where they are at `at`.
+    /// Indexes all tracks by their positions at `at`.
     pub(super) fn reindex(&mut self, at: Timestamp) {
         self.indexed_at = at;
         self.fastest_mps = self
@@ -141,7 +141,7 @@ impl TrackStore {
         }
     }
 
-    /// The same if a track may be too far from its indexed position at `at`.
+    /// Indexes all tracks again if a track may be too far from its indexed position at `at`.
     pub(super) fn reindex_if_stale(&mut self, at: Timestamp) {
         if self.drift_m(at) > self.gate_m / 2.0 {
             self.reindex(at);
@@ -160,8 +160,8 @@ impl TrackStore {
 
     /// Maximum distance of most tracks at `at` from their indexed positions, metres.
     ///
-    /// Updates of the round may have moved a track by half a gate. A new track may have moved farther; it is found from
-    /// the next round on.
+    /// Updates of the round may have moved a track by half a gate. A new track may have moved farther; the next index
+    /// contains it.
     pub(super) fn slack_m(&self, at: Timestamp) -> f64 {
         self.drift_m(at) + self.gate_m / 2.0
     }
@@ -176,7 +176,7 @@ impl TrackStore {
         self.grid.near(position, reach_m, visit);
     }
 
-    /// Takes note that a track's velocity has changed.
+    /// Records that a track's velocity has changed.
     pub(super) fn note_speed(&mut self, index: TrackIndex) {
         self.fastest_mps = self.fastest_mps.max(self[index].state.velocity.norm());
     }
@@ -186,19 +186,19 @@ impl TrackStore {
         self.of_vehicle.get(&vehicle).copied()
     }
 
-    /// Makes a track that of a vehicle.
+    /// Records the vehicle to which a track belongs.
     pub(super) fn set_vehicle(&mut self, index: TrackIndex, vehicle: SensorId) {
         self.of_vehicle.insert(vehicle, index);
         self[index].vehicle = Some(vehicle);
     }
 
-    /// Merges the later track into the older one; the later one stays until the next [`Self::retain`].
+    /// Merges the later track into the older track. The later track is removed by the next [`Self::retain`].
     pub(super) fn merge(&mut self, older: TrackIndex, later: TrackIndex) {
         let merged = self[later].clone();
         self[older].merge(merged);
     }
 
-    /// Removes the other tracks and clears the indexes; every [`TrackIndex`] is invalid afterwards.
+    /// Removes the tracks that do not match and clears the indexes; every [`TrackIndex`] is invalid afterwards.
     pub(super) fn retain(&mut self, mut keep: impl FnMut(TrackIndex, &Track) -> bool) {
         let mut number = 0;
         self.tracks.retain(|track| {
@@ -208,7 +208,7 @@ impl TrackStore {
         self.clear_indexes();
     }
 
-    /// Forgets the vehicles that are not `known`.
+    /// Removes the vehicles for which `known` returns false.
     pub(super) fn retain_vehicles(&mut self, known: impl Fn(SensorId) -> bool) {
         for track in &mut self.tracks {
             track.history.retain(&known);

@@ -181,7 +181,7 @@ fn fixed_camera_is_no_object() {
     let mut round = TracksRound::default();
     for frame in 0..20 {
         let pose = Some(WirePose::new(0.0, 0.0, 0.0));
-        // An object at a known place is of no concern here.
+        // The tracker ignores an object at a landmark.
         let known = PerceivedObject {
             landmark: Some("gate".into()),
             ..car(5.0, 5.0)
@@ -270,7 +270,7 @@ fn vacated_position_counts_no_misses() {
     assert_eq!(existence(5), existence(0));
 }
 
-/// A vehicle's first pose counts once: half of what a second one says.
+/// A vehicle's first pose counts once: it adds half of the evidence of a second pose.
 #[test]
 fn spawning_pose_counts_once() {
     let mut tracker = tracker();
@@ -461,7 +461,7 @@ fn jump_discards_pose_offset() {
     );
 }
 
-/// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.
+/// Twelve parked cars detected by both vehicles; `gauss` is off by an offset and a rotation. Returns the last round.
 fn misaligned(config: TracksConfig) -> TracksRound {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let mut tracker = Tracker::new(config, ReputationConfig::default());
@@ -543,7 +543,7 @@ fn equal_input_gives_equal_identities() {
         .unwrap();
     assert!(taken_over.existence.unwrap() > 0.8, "{taken_over:?}");
     let later = two_cars(&mut newcomer, 31..80, |_| true);
-    assert_eq!(later.objects.len(), 2, "a map alone keeps nothing alive");
+    assert_eq!(later.objects.len(), 2, "a map alone does not keep tracks");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! One track: an object that is followed.
+//! One track: the estimate of one object over time.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -23,10 +23,10 @@ use crate::wire::{FusedObject, PerceivedObject};
 /// Maximum age of another vehicle's detection that confirms a track.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
 
-/// Maximum number of labels of a track; the likeliest stay.
+/// Maximum number of labels of a track; the most likely labels are kept.
 const MAX_LABELS: usize = 8;
 
-/// Similarity to a label that was never read.
+/// Similarity to a label without any reading.
 pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
 
 /// Maximum position error of a useful object, metres.
@@ -39,15 +39,15 @@ const ERROR_RATE: f64 = 1.6;
 /// Number of detections that confirm a track.
 pub(super) const CONFIRMED_HITS: u32 = 5;
 
-/// Maximum evidence of the looks at an object that one vehicle alone detects, nats.
+/// Maximum evidence from observations for an object that only one vehicle detects, nats.
 const SOLE_NATS: f64 = 2.0;
 
-/// Maximum evidence for an object that one vehicle alone detects while others have its place in view, nats. Two of these
-/// outweigh it, each by -2.5 nats at most.
+/// Maximum evidence for an object that only one vehicle detects while others have its place in view, nats. Two of the
+/// others outweigh this evidence with at most -2.5 nats each.
 const MAX_DENIED_NATS: f64 = 4.0;
 
-/// Minimum number of vehicles whose looks count against an object that one vehicle alone detects: one statement against
-/// another does not tell which vehicle is wrong.
+/// Minimum number of vehicles whose observations count against an object that only one vehicle detects. With one
+/// statement against another, it is open which vehicle is wrong.
 const MIN_DENYING: usize = 2;
 
 /// Maximum age of a detection that is evidence of a present object.
@@ -63,20 +63,21 @@ pub(super) struct Track {
     labels: SmallVec<[(Label, f64); 1]>,
     /// Direction that vehicles stated.
     heading_rad: Option<f64>,
-    /// Direction by another aggregator, which may be the course of then; it holds until a course is known here.
+    /// Direction from another aggregator's map, which may be outdated; used until this aggregator has estimated a
+    /// course.
     inherited_heading_rad: Option<f64>,
     size_m: Option<[f64; 2]>,
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
-    /// Existence by the results of all looks.
+    /// Existence from all observations.
     pub(super) existence: Existence,
-    /// True if the last look of any vehicle was a detection.
+    /// True if the last observation of any vehicle was a detection.
     is_detected: bool,
     /// The vehicle whose detection began the track.
     pub(super) spawned_by: Option<SensorId>,
     /// True if the track has been counted as an object.
     pub(super) is_settled: bool,
-    /// The vehicle that this track is, by its reported pose.
+    /// The vehicle that reports this track as its own pose.
     pub(super) vehicle: Option<SensorId>,
     /// Number of detections.
     pub(super) hits: u32,
@@ -162,7 +163,7 @@ impl Track {
         self.hits = self.hits.saturating_add(1);
     }
 
-    /// Similarity of a detection's labels to those of the track, 0 to 1.
+    /// Similarity of a detection's labels to the track's labels, 0 to 1.
     pub(super) fn label_similarity(&self, object: &PerceivedObject) -> f64 {
         if self.labels.is_empty() {
             return 1.0;
@@ -199,14 +200,15 @@ impl Track {
         self.existence.predict(at, leaving_hz, self.is_detected);
     }
 
-    /// Takes note of whether any vehicle detects the object at `at`.
+    /// Records whether any vehicle detects the object at `at`.
     pub(super) fn note_detected(&mut self, at: Timestamp) {
         self.is_detected = self.history.iter().any(|history| {
             history.state.is_hit() && at.since(history.last_look) <= DETECTED_WITHIN
         });
     }
 
-    /// Probability that the object is there at `at`, by looks and confidences; `trust` is that in a vehicle, 0 to 1.
+    /// Probability that the object is there at `at`, from observations and confidences; `trust` returns the trust in a
+    /// vehicle, 0 to 1.
     pub(super) fn existence_at(
         &self,
         at: Timestamp,
@@ -222,7 +224,7 @@ impl Track {
         let Some(denied) = self.denied_nats(at, trust) else {
             return logistic(looks + confidences);
         };
-        // What deceives one vehicle deceives it again and again.
+        // The cause of a false detection persists, so repeated detections by one vehicle are not independent.
         let sole = looks.min(SOLE_NATS) + confidences;
         if denied < 0.0 {
             logistic(sole.min(MAX_DENIED_NATS) + denied)
@@ -231,8 +233,8 @@ impl Track {
         }
     }
 
-    /// Evidence against an object that one vehicle alone has detected, nats: that of all vehicles that have its place in
-    /// view, if there are at least [`MIN_DENYING`]. `None` if several vehicles have detected the object.
+    /// Evidence against an object that only one vehicle has detected, nats: the sum over all vehicles that have its
+    /// place in view, if there are at least [`MIN_DENYING`]. `None` if several vehicles have detected the object.
     pub(super) fn denied_nats(
         &self,
         at: Timestamp,
@@ -263,13 +265,13 @@ impl Track {
             .filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
-    /// Whether another vehicle than `sensor` detected the object shortly before `at`.
+    /// Whether a vehicle other than `sensor` detected the object shortly before `at`.
     pub(super) fn is_seen_by_others(&self, sensor: SensorId, at: Timestamp) -> bool {
         self.seen_by(at - CONFIRMED_WITHIN)
             .any(|history| history.sensor != sensor)
     }
 
-    /// Merges a later track of the same object; the identity and labels of this one stay.
+    /// Merges a later track of the object; the identity and labels of this track are kept.
     pub(super) fn merge(&mut self, other: Self) {
         self.history.merge(other.history);
         if self.last_seen < other.last_seen {
@@ -358,7 +360,7 @@ impl Track {
         }
     }
 
-    /// The likeliest label; a track without labels is a vehicle that only its own pose reports.
+    /// The most likely label; a track without labels is a vehicle without detections by others.
     pub(super) fn label(&self, config: &TracksConfig) -> Label {
         let best = self
             .labels
@@ -367,7 +369,7 @@ impl Track {
         best.map_or_else(|| config.vehicle_label.clone(), |(label, _)| label.clone())
     }
 
-    /// Direction of the velocity, radians; `None` unless the velocity is well known.
+    /// Direction of the velocity, radians; `None` if the velocity is too uncertain.
     fn course_rad(&self) -> Option<f64> {
         let velocity: Vector2<f64> = self.state.velocity;
         let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();

@@ -33,7 +33,7 @@ pub struct Tracker {
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
     frame: TurningFrame,
-    /// Time of the latest report that was fused.
+    /// Time of the latest fused report.
     fused_until: Timestamp,
     late: u64,
     /// Time of the last round.
@@ -43,7 +43,7 @@ pub struct Tracker {
 }
 
 impl Tracker {
-    /// A tracker without tracks; takes both configurations as valid.
+    /// A tracker without tracks. Both configurations must be valid.
     pub fn new(config: TracksConfig, reputation: ReputationConfig) -> Self {
         Self {
             sensors: Sensors::new(reputation),
@@ -60,7 +60,7 @@ impl Tracker {
         }
     }
 
-    /// The same tracks and trust under other settings, taken as valid.
+    /// Returns the tracker with new settings and unchanged tracks and trust. The settings must be valid.
     #[must_use]
     pub(crate) fn configured(mut self, config: TracksConfig, reputation: ReputationConfig) -> Self {
         self.tracks.configure(&config);
@@ -71,7 +71,7 @@ impl Tracker {
         Self { config, ..self }
     }
 
-    /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
+    /// Adds an admitted report, captured at `captured_at` on the aggregator's clock; false if the report is too late.
     pub fn observe(
         &mut self,
         report: impl Into<Arc<ObjectReport>>,
@@ -80,7 +80,7 @@ impl Tracker {
         self.observe_only(report.into(), captured_at, |_| true)
     }
 
-    /// Takes the `wanted` objects of a report: those at no known location.
+    /// Adds the `wanted` objects of a report: objects away from landmarks.
     pub fn observe_only(
         &mut self,
         mut report: Arc<ObjectReport>,
@@ -98,17 +98,17 @@ impl Tracker {
         true
     }
 
-    /// Takes the trust in all vehicles from a ledger.
+    /// Adopts the trust in all vehicles from a ledger.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.sensors.adopt(ledger);
     }
 
-    /// Takes evidence of VOTE about vehicles that are heard.
+    /// Adds evidence of VOTE about reporting vehicles.
     pub fn learn(&mut self, evidence: &[Evidence]) {
         self.sensors.learn(evidence);
     }
 
-    /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.
+    /// Takes over identities, and objects without a track here, from another aggregator's map, received at `now`.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         let steady = self.frame.steady_map(map, now);
         adopt_map(
@@ -119,8 +119,8 @@ impl Tracker {
         );
     }
 
-    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`; their times are by its clock.
-    /// Frames that turn have no place on Earth and no neighbours.
+    /// Replaces all objects of neighbouring cells; their ages are relative to `stated_at`, and their times use its
+    /// clock. A turning frame has no position on Earth and no neighbours.
     pub fn take_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
         self.foreign.take(
             objects,
@@ -131,12 +131,12 @@ impl Tracker {
         );
     }
 
-    /// True if an object of a neighbouring cell is not to be shown: it is one of the tracks, or its cell is not believed.
+    /// True if an object of a neighbouring cell is not published, because it matches a track or its cell is distrusted.
     pub fn hides(&self, object: &NeighbourObject) -> bool {
         self.foreign.hides(object, &self.sensors.fleet)
     }
 
-    /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar.
+    /// Weight of a neighbouring cell's statements, 0 to 1: 1 for a newcomer, 0 for a cell with proven false statements.
     pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
         self.foreign.trust(cell, &self.sensors.fleet)
     }
@@ -146,7 +146,7 @@ impl Tracker {
         self.foreign.hand_overs
     }
 
-    /// Begins a leadership: earlier observations are for the leader before to judge.
+    /// Begins a leadership: the previous leader judges earlier observations.
     pub(crate) fn begin_record(&mut self, now: Timestamp) {
         self.recorded_from = now;
     }
@@ -210,7 +210,7 @@ impl Tracker {
         }
     }
 
-    /// The reports of a round in the order of capture, whatever the order of arrival.
+    /// The reports of a round in the order of capture, independently of their order of arrival.
     fn in_order(&self, pending: Vec<(Timestamp, Arc<ObjectReport>)>) -> Vec<Captured> {
         let prior = self.config.bias_prior();
         let mut reports: Vec<Captured> = pending
@@ -232,7 +232,7 @@ impl Tracker {
         reports
     }
 
-    /// Updates the tracks, instant by instant; returns what registration needs, and judgements of the vehicles.
+    /// Updates the tracks, instant by instant; returns the frames for registration, and judgements of the vehicles.
     fn update(
         &mut self,
         reports: &[Captured],

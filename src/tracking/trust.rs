@@ -1,9 +1,10 @@
-//! Trust in vehicles: which of them report objects that others see, and which fabricate or hide objects.
+//! Trust in vehicles: whether a vehicle reports objects that other vehicles confirm, or fabricates or hides objects.
 //!
-//! Every [`JUDGED_AFTER`] of looks, a vehicle's statement about an object is compared with the evidence of the others.
-//! Where they agree that the object exists, a detection is correct; not to have detected it since the last judgement is a
-//! miss if most of the others that look detect it, and most vehicles detect objects at that distance. Where at least two others
-//! look and agree that nothing exists, a detection is a false positive. One vehicle against another settles nothing.
+//! Every [`JUDGED_AFTER`] of observations, a vehicle's statement about an object is compared with the evidence of the
+//! others. If the others agree that the object exists, a detection counts as correct. No detection since the last
+//! judgement counts as a miss if most of the others that observe the place detect the object, and most vehicles detect
+//! objects at that distance. If at least two others observe the place and agree that it is empty, a detection counts as
+//! a false positive. Two vehicles that disagree yield no judgement.
 
 use std::collections::BTreeMap;
 
@@ -20,16 +21,16 @@ const EXISTS_NATS: f64 = 2.0;
 /// Maximum log-odds, by the others' evidence, of an object that does not exist.
 const ABSENT_NATS: f64 = -1.5;
 
-/// Minimum share of looks with a detection for which a vehicle states that an object exists.
+/// Minimum share of observations with a detection for which a vehicle states that an object exists.
 const MIN_STATED: f64 = 0.4;
 
 /// Minimum share of vehicles that detect objects at a distance, for a miss there to be judged.
 const MIN_EXPECTED: f64 = 0.6;
 
-/// Weight above which a vehicle counts as one of the others.
+/// Minimum weight of a vehicle whose evidence is used to judge others.
 const MIN_PEER_WEIGHT: f64 = 0.5;
 
-/// Share of a newcomer's reputation at and below which evidence weighs nothing.
+/// Share of a newcomer's reputation at and below which evidence has no weight.
 const WORTHLESS: f64 = 0.6;
 
 /// Judgement of a vehicle's statement about an object.
@@ -41,18 +42,18 @@ pub(super) enum Judgement {
     FalsePositive,
     /// The vehicle did not detect an object that exists.
     Miss,
-    /// The vehicle detected an object that exists, at a place that is wrong by more than it states.
+    /// The vehicle detected an object that exists, with a position error larger than the vehicle states.
     Shifted,
 }
 
-/// Evidence of all vehicles but one about an object.
+/// Evidence of all vehicles except the judged vehicle about an object.
 #[derive(Debug, Clone, Copy, Default)]
 struct PeerEvidence {
     /// Log-odds of existence.
     nats: f64,
-    /// Number of vehicles that looked.
+    /// Number of vehicles that observed the place.
     looking: usize,
-    /// Number of vehicles that detected it recently.
+    /// Number of vehicles that detected the object recently.
     detecting: usize,
 }
 
@@ -105,7 +106,7 @@ impl PeerEvidence {
     }
 }
 
-/// Correct and incorrect statements of one vehicle, the latest ones counting most.
+/// Correct and incorrect statements of one vehicle; the latest statements have the highest weight.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct TrustCounts {
     correct: f64,
@@ -140,20 +141,22 @@ impl TrustCounts {
         self.correct + self.incorrect
     }
 
-    /// True if there are as many statements as the initial score weighs, and the reputation is no worse.
+    /// True if the number of statements is at least the weight of the initial score, and the reputation is not below
+    /// that score.
     pub(super) fn is_proven(&self, config: &ReputationConfig) -> bool {
         self.total() >= config.initial_votes
             && config.mean(self.correct, self.incorrect) >= config.initial
     }
 
-    /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
+    /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 for a vehicle with proven false
+    /// statements.
     pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
         let reputation = config.mean(self.correct, self.incorrect);
         ((reputation / config.initial - WORTHLESS) / (1.0 - WORTHLESS)).clamp(0.0, 1.0)
     }
 }
 
-/// Counts of vehicles that are not heard at present.
+/// Counts of vehicles that do not report at present.
 #[derive(Debug, Clone, Default)]
 pub(super) struct DormantCounts(BTreeMap<NodeName, TrustCounts>);
 
@@ -166,7 +169,7 @@ impl DormantCounts {
         self.0.get(node).copied().unwrap_or_default()
     }
 
-    /// Keeps the counts of vehicles; those with the fewest statements make room.
+    /// Keeps the counts of vehicles; the vehicles with the fewest statements are evicted.
     pub(super) fn keep(&mut self, vehicles: impl IntoIterator<Item = (NodeName, TrustCounts)>) {
         self.0.extend(
             vehicles
@@ -188,13 +191,13 @@ impl DormantCounts {
     }
 }
 
-/// Trust in every vehicle and detection rates of all: the standard by which one vehicle is judged.
+/// Trust in every vehicle, and detection rates of all vehicles for judging a single vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct Fleet {
     reputation: ReputationConfig,
     /// Weight of the evidence of each vehicle by its id, 0 to 1.
     trust: Vec<f64>,
-    /// By distance, the number of vehicles that detected an object that exists, and of all.
+    /// By distance, the number of vehicles that detected an existing object, and of all vehicles.
     detections: Vec<(f64, f64)>,
 }
 
@@ -215,7 +218,7 @@ impl Fleet {
         }
     }
 
-    /// Goes on with other parameters of reputations.
+    /// Changes the parameters of reputations.
     pub(super) fn configure(&mut self, reputation: ReputationConfig) {
         self.reputation = reputation;
     }
@@ -230,7 +233,7 @@ impl Fleet {
         self.trust.get(sensor.number()).copied().unwrap_or(0.0)
     }
 
-    /// Sets the counts from which a vehicle's trust follows.
+    /// Sets the counts from which the trust in a vehicle is computed.
     pub(super) fn set_counts(&mut self, sensor: SensorId, counts: &TrustCounts) {
         let number = sensor.number();
         let room = self.trust.len().max(number + 1);
@@ -249,8 +252,8 @@ impl Fleet {
         self.set_counts(sensor, counts);
     }
 
-    /// Judges a vehicle's statement about an object `distance_m` away by the evidence of the others; `None` where they
-    /// settle nothing.
+    /// Judges a vehicle's statement about an object `distance_m` away by the evidence of the other vehicles; `None` if
+    /// that evidence is insufficient.
     pub(super) fn judge(
         &mut self,
         sensor: SensorId,
@@ -266,7 +269,7 @@ impl Fleet {
         (judgement != Judgement::Miss || self.expects(distance_m)).then_some(judgement)
     }
 
-    /// Judges the statement of somebody beyond these vehicles that an object exists, by what they saw of it.
+    /// Judges the statement of another cell that an object exists, by the observations of these vehicles.
     pub(super) fn judge_stated(
         &self,
         history: &DetectionHistory,

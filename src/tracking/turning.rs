@@ -1,8 +1,8 @@
-//! Reports in a frame that turns, as one that is fixed to a vehicle does.
+//! Reports in a turning frame, for example in a frame that is fixed to a vehicle.
 //!
-//! In such a frame whatever stands goes in a circle, which no filter of nearly constant velocity follows. Tracks therefore
-//! live in a frame with the same origin that does not turn: its angle is the integral of the yaw rates that the reports
-//! state. A report without one states that the frame does not turn.
+//! In such a frame a standing object moves in a circle, which a filter of nearly constant velocity cannot follow.
+//! Tracks therefore use a frame with the same origin that does not turn: the angle between both frames is the integral
+//! of the yaw rates that the reports state. A report without a yaw rate states that the frame does not turn.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport, PoseCorrection};
 
-/// Time for which a yaw rate holds.
+/// Time for which a yaw rate is valid.
 const HELD: Duration = Duration::from_secs(1);
 
 /// Angle of the frame of all reports and maps against the frame of the tracks.
@@ -24,12 +24,12 @@ pub(super) struct TurningFrame {
     at: Timestamp,
     angle_rad: f64,
     rate_radps: f64,
-    /// By vehicle, the yaw rate of its latest report, with the time and number of that.
+    /// By vehicle, the yaw rate of its latest report, with the time and number of the report.
     stated: BTreeMap<NodeName, (Timestamp, u64, f64)>,
 }
 
 impl TurningFrame {
-    /// Notes the yaw rate that a report states, captured at `at`.
+    /// Records the yaw rate that a report states, captured at `at`.
     pub(super) fn note(&mut self, report: &ObjectReport, at: Timestamp) {
         let latest = (at, report.seq, report.frame_yaw_rate_radps.unwrap_or(0.0));
         let known = self.stated.entry(report.node.clone()).or_insert(latest);
@@ -38,8 +38,8 @@ impl TurningFrame {
         }
     }
 
-    /// Moves on to `now`, with the yaw rate that each trusted vehicle stated last. The median holds, the lesser of two in the
-    /// middle: no single vehicle turns the frame of others.
+    /// Advances to `now` with the median of the last yaw rates of trusted vehicles. For an even number, the middle rate
+    /// with the smaller magnitude is used, so that a single vehicle cannot turn the frame of others.
     pub(super) fn advance(&mut self, now: Timestamp, is_trusted: impl Fn(&NodeName) -> bool) {
         self.stated.retain(|_, (at, ..)| now.since(*at) <= HELD);
         let trusted = self.stated.iter().filter(|(node, _)| is_trusted(node));
@@ -65,7 +65,7 @@ impl TurningFrame {
         self.angle_rad != 0.0 || self.rate_radps != 0.0
     }
 
-    /// From the frame of the reports at `at` to that of the tracks; `None` while they are the same.
+    /// The turn from the frame of the reports at `at` to the frame of the tracks; `None` while both are equal.
     fn turn(&self, at: Timestamp) -> Option<Turn> {
         let passed_s = at.micros_from(self.at) as f64 * 1e-6;
         let angle_rad = self.angle_rad + self.rate_radps * passed_s;
@@ -108,7 +108,7 @@ impl TurningFrame {
         Some(map)
     }
 
-    /// Puts the objects and corrections of a map at `now` into the frame of the reports.
+    /// Converts the objects and corrections of a map at `now` to the frame of the reports.
     pub(super) fn restore<'a>(
         &self,
         now: Timestamp,

@@ -1,8 +1,8 @@
 //! Twins: two tracks of one object.
 //!
-//! Two tracks that are near each other are two objects if a vehicle detects both in one frame. They are one if some
-//! vehicles detect only this one while others detect only that one: two objects would be detected together. The
-//! log-likelihood ratio of the two adds up look by look, a sequential probability ratio test (Wald, 1945).
+//! Two tracks that are near each other are two objects if a vehicle detects both in one frame. They are one object if
+//! some vehicles detect only the first track and others only the second, because a vehicle would detect both of two
+//! objects. The log-likelihood ratio is summed over observations: a sequential probability ratio test (Wald, 1945).
 
 use std::time::Duration;
 
@@ -13,16 +13,16 @@ use super::detection_history::DetectionHistory;
 use super::existence::SensorHistory;
 use crate::model::time::Timestamp;
 
-/// Log-odds from which two tracks are one object. Below twice their negative, further looks change nothing.
+/// Two tracks are merged from these log-odds on. The sum is bounded below at -2 times this value.
 const TWIN_NATS: f64 = 5.0;
 
 /// Probability that a detector reports one object twice in a frame.
 const DUPLICATE: f64 = 0.05;
 
-/// Time for which a pair is remembered after its tracks were near each other.
+/// Time for which a pair is kept after its tracks were near each other.
 const REMEMBERED: Duration = Duration::from_secs(3);
 
-/// Tracks near one track, and whether they are the same object.
+/// Tracks near one track, with the log-odds that they are duplicates.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Twins(SmallVec<[Twin; 1]>);
 
@@ -31,12 +31,13 @@ struct Twin {
     id: Uuid,
     /// Log-odds that both are one object.
     nats: f64,
-    /// Time of the latest looks that count.
+    /// Time of the latest observations that were added.
     at: Timestamp,
 }
 
 impl Twins {
-    /// Weighs the looks at both tracks since the last time. `rate` is a vehicle's probability of a detection of either.
+    /// Adds the observations of both tracks since the last call. `rate` is the probability that a vehicle detects a
+    /// track in a frame.
     pub(super) fn weigh(
         &mut self,
         own: &DetectionHistory,
@@ -90,7 +91,7 @@ impl Twins {
         }
     }
 
-    /// True if the track of this identity is the same object.
+    /// True if the track with this identity is a duplicate.
     pub(super) fn is_twin(&self, id: Uuid) -> bool {
         self.0
             .iter()

@@ -1,8 +1,8 @@
 //! Update of the tracks by all reports of one instant.
 //!
 //! [`InstantUpdate::run`] updates the tracks of the reporting vehicles themselves, [associates](super::assignment) the
-//! detections of all vehicles with tracks, updates each track once with all its detections, weighs what every vehicle
-//! found in its view, updates the sensor models, and spawns tracks from the remaining detections.
+//! detections of all vehicles with tracks, updates each track once with all its detections, weighs the observations of
+//! every vehicle, updates the sensor models, and spawns tracks from the remaining detections.
 
 use nalgebra::{Matrix2, Vector2};
 
@@ -34,7 +34,7 @@ const CERTAIN: f64 = 0.9;
 /// Maximum number of objects of each neighbouring cell that are compared with a report.
 const MAX_FOREIGN_EACH: usize = 32;
 
-/// Log-odds that a vehicle exists that states its own pose.
+/// Log-odds that a vehicle exists if it states its own pose.
 const OWN_NATS: f64 = 4.0;
 
 /// Result of one instant.
@@ -45,17 +45,17 @@ pub(super) struct InstantOutcome {
     pub(super) evidence: Vec<Evidence>,
 }
 
-/// Look of one vehicle at one track.
+/// Observation of one track by one vehicle.
 struct Look {
     track: TrackIndex,
     /// Number of the scan.
     scan: usize,
-    /// Number of the detection, if the look was one.
+    /// Number of the detection, if the observation was a detection.
     detection: Option<usize>,
-    /// Where the vehicle would have reported the object, metres.
+    /// The position at which the vehicle would have reported the object, metres.
     place: Vector2<f64>,
     rates: LookRates,
-    /// State before the look.
+    /// State before the observation.
     state: LookState,
     /// True if the place is in the field of view.
     is_in_view: bool,
@@ -126,7 +126,7 @@ impl InstantUpdate<'_> {
         outcome
     }
 
-    /// Updates or spawns the track of the vehicle itself from its pose; no other report may do so.
+    /// Updates or spawns the track of the reporting vehicle from its pose. Only the vehicle's own reports do so.
     fn update_own_track(&mut self, vehicle: SensorId, report: &ObjectReport) {
         let Some(pose) = report.pose.filter(|_| report.moving != Some(false)) else {
             return;
@@ -162,7 +162,7 @@ impl InstantUpdate<'_> {
             track.state.update(at, &measurement);
             track.state.limit_speed();
         } else if known.is_some() && at >= track.state.at {
-            // The vehicle has jumped; no other vehicle can have seen it here before.
+            // The vehicle has jumped, so earlier detections at its new position were not of this vehicle.
             track.state = KinematicState::new(at, &measurement, class);
             track.history.clear();
         }
@@ -176,7 +176,7 @@ impl InstantUpdate<'_> {
         self.tracks.note_speed(index);
     }
 
-    /// All looks of the instant: detections, and misses of the tracks in view.
+    /// All observations of the instant: detections, and misses of the tracks in view.
     fn looks(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<Look> {
         let mut detected: Vec<Vec<TrackIndex>> = vec![Vec::new(); scans.len()];
         let mut looks = Vec::new();
@@ -226,7 +226,7 @@ impl InstantUpdate<'_> {
         let Some(centre) = sensor.coverage.centre() else {
             return;
         };
-        // Positions are those of the index, so that updates of the same round make no difference.
+        // Uses the positions of the index, so that the result is independent of updates within the round.
         let since_indexed_s = self.tracks.seconds_since_indexed(self.at);
         let reach_m = sensor.coverage.range_m() + self.tracks.slack_m(self.at);
         self.tracks.near(&centre, reach_m, |indexed| {
@@ -290,7 +290,7 @@ impl InstantUpdate<'_> {
                 .iter()
                 .map(|(scan, detection)| (&scans[*scan], &scans[*scan].detections[*detection]))
         };
-        // Without trusted detections, what remains of the information is a rounding error.
+        // Without trusted detections, the remaining information is only a rounding error.
         if hits().all(|(scan, _)| !scan.is_trusted()) {
             return;
         }
@@ -353,7 +353,7 @@ impl InstantUpdate<'_> {
         self.tracks.note_speed(index);
     }
 
-    /// Weighs all looks in the existences, then updates rates, calibrations and judgements by them.
+    /// Adds all observations to the existences, then updates rates, calibrations and judgements.
     fn weigh(&mut self, looks: &[Look], scans: &[Scan<'_>], evidence: &mut Vec<Evidence>) {
         let at = self.at;
         let leaving_hz = self.population.leaving_hz();
@@ -410,7 +410,7 @@ impl InstantUpdate<'_> {
         }
     }
 
-    /// Updates rates and calibration by a look and the existence after all looks of the instant.
+    /// Updates rates and calibration with an observation and the existence after all observations of the instant.
     fn learn(&mut self, look: &Look, scan: &Scan<'_>) {
         let track = &mut self.tracks[look.track];
         if track.vehicle.is_some() {
@@ -441,7 +441,7 @@ impl InstantUpdate<'_> {
         }
     }
 
-    /// Judges a vehicle's statement about a track by the evidence of the others.
+    /// Judges a vehicle's statement about a track by the evidence of the other vehicles.
     fn judge(
         &mut self,
         look: &Look,
@@ -492,7 +492,7 @@ impl InstantUpdate<'_> {
         let reach_m = sensor.coverage.range_m();
         let near_m = 2.0 * self.config.gate_m;
         let is_in_view = |place: &Vector2<f64>| sensor.coverage.rates_at(place).is_some();
-        // Objects that nobody can see take no place from others.
+        // Objects outside the view must not use up the limit per cell.
         let is_looked_at = |place: &Vector2<f64>| {
             let is_within = (place - centre).norm() <= reach_m;
             let mut places = scan
@@ -506,7 +506,7 @@ impl InstantUpdate<'_> {
             let state = foreign.history.state_of(id);
             let near = scan.detections.iter().filter(|detection| {
                 let innovation = foreign.state.innovation(at, &detection.measurement);
-                // Its place is as old as its cell's map.
+                // The position of the object is as old as its cell's map.
                 innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
             });
             let confidence = near
@@ -526,7 +526,8 @@ impl InstantUpdate<'_> {
         self.foreign.judge(&self.sensors.fleet, at);
     }
 
-    /// A new track at a measurement of object `index` of a report: an object of a neighbouring cell, if one is there.
+    /// A new track at a measurement of object `index` of a report. The track continues an object of a neighbouring cell
+    /// at that position.
     fn begin(
         &mut self,
         measurement: &Measurement,

@@ -26,7 +26,7 @@ pub struct LedgerShare {
     /// Counts, at most 512.
     #[n(3)]
     pub entries: Vec<LedgerEntry>,
-    /// Marks, at most 512; without them earlier and later votes cannot be separated.
+    /// Marks, at most 512. Without marks a receiver cannot tell which votes are recent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(4), default)]
     pub marks: Vec<LedgerMark>,
@@ -46,9 +46,6 @@ impl LedgerShare {
     /// The bytes that an aggregator signs: the compact encoding of
     /// `["ecod ledger 1", cell, entries, marks]`. Sender and term are not included, so that other
     /// nodes can pass the counts on.
-    ///
-    /// # Panics
-    /// Does not panic: it writes into memory.
     #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
     pub fn signed_bytes(&self, cell: &NodeName) -> Vec<u8> {
         let content = ("ecod ledger 1", cell, &self.entries, &self.marks);
@@ -110,8 +107,8 @@ pub struct LedgerEntry {
     pub incorrect: u64,
 }
 
-/// The numbers of right and wrong votes of one vehicle under one leadership at an earlier number of
-/// votes; written once.
+/// Snapshot of one vehicle's counts, taken when the number of its votes under this leadership
+/// reached a multiple of 32. A snapshot is not changed later.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LedgerMark {
     /// Term of the leadership that counted.

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-/// Half a metre of car in the middle of the picture, 40 pixels high.
+/// The middle of the picture: half a metre of car, 40 pixels high.
 const CAR: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
 
 /// The keys of a default camera that always detects a car 6.6 m ahead. Its files are written into the directory.

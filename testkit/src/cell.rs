@@ -1,4 +1,4 @@
-//! Cells of nodes in this process that can be killed as processes are.
+//! Cells of nodes in this process that can be killed like processes.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -20,11 +20,11 @@ use crate::wait::PATIENCE;
 /// The configuration of a node by its name, its role and the directory of the cell.
 type Configure = fn(&str, Role, &Path) -> NodeConfig;
 
-/// Nodes of one cell, each on a runtime of its own, and the directory of their files.
+/// Nodes of one cell, each on a separate runtime, and the directory of their files.
 pub struct Cell {
     configure: Configure,
     directory: TempDir,
-    /// Where the first node gossips, by which the others find the cell.
+    /// The gossip address of the first node, by which the others find the cell.
     seed: SocketAddr,
     nodes: BTreeMap<String, Running>,
 }
@@ -58,14 +58,14 @@ impl Cell {
         self.directory.path()
     }
 
-    /// The configuration of a further node, which finds those that run.
+    /// The configuration of another node, which finds the running nodes.
     pub fn config(&self, name: &str, role: Role) -> NodeConfig {
         let mut config = (self.configure)(name, role, self.directory());
         greet(&mut config, self.seed, self.nodes.is_empty());
         config
     }
 
-    /// Starts a node on a runtime of its own; the first is the seed of the others.
+    /// Starts a node on a separate runtime; the first node is the seed of the others.
     ///
     /// # Panics
     /// Panics if the node does not start.
@@ -73,7 +73,7 @@ impl Cell {
         self.start_with(self.config(name, role)).await;
     }
 
-    /// Starts a node of this configuration on a runtime of its own.
+    /// Starts a node of this configuration on a separate runtime.
     ///
     /// # Panics
     /// Panics if the node does not start.
@@ -88,7 +88,7 @@ impl Cell {
         self.nodes.insert(name, Running { node, runtime });
     }
 
-    /// Ends all tasks of a node where they are; its sockets close.
+    /// Ends all tasks of a node at once; its sockets close.
     ///
     /// # Panics
     /// Panics if no such node runs.
@@ -108,7 +108,7 @@ impl Cell {
         runtime.shutdown_background();
     }
 
-    /// Takes a node out of the cell; another one is the seed from then on.
+    /// Removes a node from the cell; another node becomes the seed.
     fn remove(&mut self, name: &str) -> Running {
         let running = self.nodes.remove(name).unwrap();
         let other = self.nodes().next();
@@ -130,7 +130,7 @@ impl Cell {
         self.directory
     }
 
-    /// A node that runs.
+    /// A running node.
     ///
     /// # Panics
     /// Panics if no such node runs.
@@ -138,24 +138,24 @@ impl Cell {
         &self.nodes[name].node
     }
 
-    /// The nodes that run, by name.
+    /// The running nodes, by name.
     pub fn nodes(&self) -> impl Iterator<Item = (&str, &NodeHandle)> {
         self.nodes
             .iter()
             .map(|(name, running)| (name.as_str(), &running.node))
     }
 
-    /// The names of the nodes that run.
+    /// The names of the running nodes.
     pub fn names(&self) -> Vec<String> {
         self.nodes.keys().cloned().collect()
     }
 
-    /// The election as a node sees it.
+    /// The election as reported by a node.
     pub fn leadership(&self, name: &str) -> Leadership {
         self.node(name).leadership().borrow().clone()
     }
 
-    /// Waits until every node follows this node, whatever maps it receives.
+    /// Waits until every node follows this node, independently of the maps that they receive.
     pub async fn led_by(&self, leader: &str) {
         self.until(&format!("all follow {leader}"), |cell| {
             let follows = |(_, node): (&str, &NodeHandle)| {
@@ -181,7 +181,7 @@ impl Cell {
         .await;
     }
 
-    /// Waits until every node accepts maps of one node that is another than this. The result is its name.
+    /// Waits until every node accepts maps of one node other than this node, and returns its name.
     pub async fn served_by_another_than(&self, old: &str) -> String {
         self.until(&format!("another than {old} serves all"), |cell| {
             let sources = cell.sources();
@@ -192,7 +192,7 @@ impl Cell {
         .await
     }
 
-    /// Waits until all agree who leads next, and have a link to it. The result is its name.
+    /// Waits until all nodes agree on the standby and have a link to it, and returns its name.
     pub async fn standby_is_named(&self) -> String {
         let standby = self
             .until("all agree on the standby", |cell| {
@@ -222,7 +222,7 @@ impl Cell {
     /// Waits until the condition has a result.
     ///
     /// # Panics
-    /// Panics if it has none within [`PATIENCE`].
+    /// Panics without a result within [`PATIENCE`].
     pub async fn until<T>(&self, what: &str, mut holds: impl FnMut(&Self) -> Option<T>) -> T {
         let deadline = Instant::now() + PATIENCE;
         loop {

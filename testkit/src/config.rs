@@ -27,7 +27,8 @@ pub fn free_gossip_address() -> SocketAddr {
     UdpSocket::bind(loopback()).unwrap().local_addr().unwrap()
 }
 
-/// A node that listens on loopback, has no page, and does not find the cells of other tests: its cell is found by seeds.
+/// A node that listens on loopback, has no page, and does not find the cells of other tests: it finds its cell by
+/// seeds.
 pub fn node_config(node: &str, cell: &str, role: Role) -> NodeConfig {
     let mut config = NodeConfig {
         name: Some(name(node)),
@@ -42,7 +43,7 @@ pub fn node_config(node: &str, cell: &str, role: Role) -> NodeConfig {
     config
 }
 
-/// Lets a node find its cell by the address at which the node that `is_seed` gossips.
+/// Makes a node find its cell by `seed`, the gossip address of the node with `is_seed`.
 pub fn greet(config: &mut NodeConfig, seed: SocketAddr, is_seed: bool) {
     config.membership.bind = Some(if is_seed { seed } else { loopback() });
     config.membership.seeds = vec![seed.to_string()];

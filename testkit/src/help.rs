@@ -2,7 +2,7 @@
 
 use crate::program::{command, output_of};
 
-/// What `--help` of a program and of all of its commands prints, each behind its command line.
+/// The output of `--help` of a program and of all its commands, each after its command line.
 ///
 /// # Panics
 /// Panics if the program or one of its commands has no help.

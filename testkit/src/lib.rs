@@ -1,7 +1,8 @@
-//! Fixtures that the integration tests of all crates share. Every node is on loopback and meets only the nodes of its test.
+//! Fixtures that the integration tests of all crates share. Every node runs on loopback and communicates only with the
+//! nodes of its test.
 //!
-//! [`node_config`] is a node's configuration to start from, and [`Cell`] runs nodes that can be killed as processes are.
-//! [`Member`] is the membership of a node alone. A test that waits uses [`until`], never a guessed time.
+//! [`node_config`] is a basic configuration of a node, and [`Cell`] runs nodes that can be killed like processes.
+//! [`Member`] is the membership of a node alone. A test that waits uses [`until`] instead of a fixed time.
 
 mod camera;
 mod cell;

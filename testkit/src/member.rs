@@ -15,15 +15,15 @@ use tokio::sync::watch;
 
 use crate::config::{loopback, name};
 
-/// A node's membership on real sockets, and what it reports.
+/// A node's membership on real sockets, and its events.
 pub struct Member {
     /// The node's name.
     pub name: NodeName,
     /// The actor.
     pub actor: ActorRef<MembershipMessage>,
-    /// Where it gossips.
+    /// The gossip address.
     pub address: SocketAddr,
-    /// Everything that it has reported so far.
+    /// All events so far.
     pub events: Arc<Mutex<Vec<MembershipEvent>>>,
     /// The other members.
     pub members: watch::Receiver<Vec<ecod_actors::transport::gossip::Member>>,
@@ -31,7 +31,7 @@ pub struct Member {
     pub counters: Arc<FrameCounters>,
 }
 
-/// A membership on a free port of loopback, with the key that all members of the tests have, without multicast.
+/// A membership on a free port of loopback, without multicast, with the common key of the tests.
 pub fn member_config(seeds: &[SocketAddr]) -> MembershipConfig {
     let mut config = MembershipConfig {
         key: Some(Secret::new("5e".repeat(32))),
@@ -44,7 +44,7 @@ pub fn member_config(seeds: &[SocketAddr]) -> MembershipConfig {
 }
 
 impl Member {
-    /// Starts a candidate of the cell `lot` without certificates; `adjust` changes that.
+    /// Starts a candidate of the cell `lot` without certificates; `adjust` changes its arguments.
     ///
     /// # Panics
     /// Panics if the membership cannot start.

@@ -1,6 +1,6 @@
-//! Every follower accepts what a leader publishes, whatever valid messages the leader has received:
-//! verdicts, reputations, evidence and counts for other cells, statuses with troubles, and
-//! descriptions. For maps see `src/aggregator/tests/accepted_by_receivers.rs`.
+//! Every follower accepts the publications of a leader, independently of the valid messages that the leader has
+//! received: verdicts, reputations, evidence and counts for other cells, statuses with troubles, and descriptions. For
+//! maps see `src/aggregator/tests/accepted_by_receivers.rs`.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -65,7 +65,7 @@ fn label() -> impl Strategy<Value = String> {
     ]
 }
 
-/// Texts of strangers, of any letters, and those that grow most in JSON.
+/// Texts of other nodes, with any letters, and texts that grow most in JSON.
 fn words(most: usize) -> impl Strategy<Value = String> {
     prop_oneof!["\\PC{0,80}", "[\\x00-\\x1f\"\\\\]{0,400}", quotes(most),]
 }

@@ -367,7 +367,8 @@ fn flicker_within_margin_keeps_label() {
     assert_eq!(labels(&pace.close(START).landmarks), [Some("van")]);
 }
 
-/// A car that one vehicle invents, where others look and find nothing; they list what they saw, or state their field of view.
+/// A car that one vehicle invents in a place that others observe as empty; the others list their observed landmarks, or
+/// state their field of view.
 #[test]
 fn contradicted_sole_claim_is_unpublished() {
     let facing = |node: &str, listed: bool| {

@@ -1,6 +1,7 @@
 //! Replay of the committed recording. Debug and release builds run this test: all must give the bytes of these digests.
 //!
-//! A change of fusion changes the digests. Whoever makes one replaces them by those that the test prints.
+//! A change of fusion changes the digests. The author of such a change replaces them by the digests that the test
+//! prints.
 
 use ecod::aggregator::FusionConfig;
 use ecod::perception::landmark::{Landmark, LandmarkConfig};

@@ -1,6 +1,6 @@
 //! The rooms of the house: modules of each crate by floor, read from the code. Imports run downward, without a circle.
 //!
-//! A room is a module of a crate's root. A folder has rooms of its own: its modules. Tests are left out.
+//! A room is a module of a crate's root. The rooms of a folder are its modules. Tests are omitted.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -45,7 +45,7 @@ fn imports_have_no_cycle() {
     );
 }
 
-/// Names that every actor or program has one of.
+/// Names of which every actor or program has one.
 const IDIOMS: [&str; 6] = ["Arguments", "Cli", "Command", "Error", "Msg", "State"];
 
 #[test]
@@ -62,7 +62,7 @@ fn type_names_are_unique() {
                 syn::Item::Type(item) => (item.ident, item.attrs),
                 _ => continue,
             };
-            // One of two that stand for each other.
+            // Items with `cfg` are alternatives of one item.
             if !attributes
                 .iter()
                 .any(|attribute| attribute.path().is_ident("cfg"))

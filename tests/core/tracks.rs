@@ -1,4 +1,4 @@
-//! Tracking through the aggregator and the replay: what comes out of a cell for what its vehicles report.
+//! Tracking through the aggregator and the replay: the outputs of a cell for the reports of its vehicles.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,7 +26,7 @@ fn report(node: &str, frame: u64, at: Timestamp, objects: Vec<PerceivedObject>) 
     }
 }
 
-/// A car that goes east at 8 m/s and one that stands, as two vehicles see them.
+/// A car that drives east at 8 m/s and a standing car, as two vehicles detect them.
 fn cars(frame: u64) -> Vec<PerceivedObject> {
     vec![
         PerceivedObject::new("car", 0.9, 0.8 * frame as f64, 0.0),
@@ -44,7 +44,7 @@ fn replayed(lines: &[ObjectReport]) -> (Vec<GlobalMap>, Summary) {
     output.extend(rest);
     let map = |line| match line {
         FusedLine::Map(map) => map,
-        FusedLine::Verdicts(verdicts) => panic!("nobody voted: {verdicts:?}"),
+        FusedLine::Verdicts(verdicts) => panic!("there are no votes: {verdicts:?}"),
     };
     (output.into_iter().map(map).collect(), summary)
 }
@@ -196,8 +196,8 @@ fn standby_keeps_identities() {
     assert_eq!(ids(&next), ids(&map.unwrap()));
 }
 
-/// Detections of `euclid` in frames that were overtaken by the next are in the map too, once each; one that comes later than
-/// the bound is not, and is counted.
+/// The map contains each detection of `euclid` once, including detections in frames that arrive after the next frame. A
+/// frame later than the bound is discarded and counted.
 #[test]
 fn overtaken_reports_count_for_tracks_only() {
     let tracks = TracksConfig {
@@ -334,8 +334,8 @@ fn precise_shifted_vehicle_hardly_moves_map() {
     }
 }
 
-/// Share of the maps in which a car that one vehicle invents is more probable than not, while four that have its place in
-/// view report nothing there: at a known location, and elsewhere.
+/// Share of the maps in which a car that one vehicle invents has a probability above 0.5, while four vehicles that have
+/// its place in view report no car: at a landmark, and elsewhere.
 #[test]
 fn contradicted_invention_is_no_fact() {
     let place = Landmark {

@@ -331,7 +331,7 @@ fn adopted_ledger_restores_class_trust() {
         );
         verdict.label.unwrap()
     };
-    // Each states one label that it is always right about and one that it mostly gets wrong.
+    // Each vehicle states one label that it always reads correctly and one label that it mostly misreads.
     assert_eq!(verdict([("a", "cup"), ("b", "cup")]), "cup");
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     vote.adopt(&ledger);
@@ -438,7 +438,7 @@ fn majority_holds_in_any_order() {
 }
 
 /// One vehicle reports the truth while it is alone, and another label everywhere as soon as others come, one every ten
-/// seconds. All places, or nearly all, have one label, so that agreement beyond chance tells nothing.
+/// seconds. All landmarks, or nearly all, have one label, so that agreement beyond chance contains no information.
 #[test]
 fn later_majority_outvotes_first() {
     for rare in [0, 1, 3] {

@@ -87,7 +87,7 @@ struct Cell {
 struct CellModel {
     initial: Vec<Cell>,
     depth: usize,
-    /// One in so many states of the last depth is let settle.
+    /// Share of the states of the last depth, one in this many, from which the model runs until it is stable.
     sample: u64,
 }
 
@@ -205,7 +205,7 @@ impl Cell {
         self.carry_out(index, effects);
     }
 
-    /// The next thing that a timer does: a look at the own parts, which all work, is nothing.
+    /// The next action of a timer, except checks of the own parts, which have no effect because all parts work.
     fn tick(&mut self, index: usize) -> Vec<Effect> {
         loop {
             let node = &mut self.nodes[index];
@@ -243,7 +243,7 @@ impl Cell {
         }
     }
 
-    /// Does what the machine wants; returns what it is to be told.
+    /// Carries out an effect of the machine; returns the resulting input.
     fn carry_out_one(&mut self, index: usize, effect: Effect) -> Option<Input> {
         let nodes = self.nodes.len();
         let node = &mut self.nodes[index];
@@ -376,7 +376,7 @@ impl Cell {
         }
     }
 
-    /// Time passes evenly, everything sent arrives, and nobody crashes.
+    /// Time passes evenly, every message arrives, and no node crashes.
     fn run_quietly(&mut self, millis: u64) {
         let mut left = Duration::from_millis(millis);
         while !left.is_zero() {
@@ -400,7 +400,8 @@ impl Cell {
 
     fn converges(&self) -> bool {
         let mut quiet = self.clone();
-        // A peer that fell silent counts as heard for 2.5 idle beats (6.25 s); then come `stable_ms` and a handover.
+        // A peer that became silent counts as present for 2.5 idle beats (6.25 s); then come `stable_ms` and a
+        // handover.
         quiet.run_quietly(14_000);
         let running = || {
             quiet
@@ -544,8 +545,8 @@ impl Model for CellModel {
     }
 }
 
-/// A cell that starts, one that has just elected its leader, one a moment before its edge is offered the lead and one before
-/// it is ready to take it, and one that was split.
+/// A starting cell, a cell that has just elected its leader, a cell a moment before its edge is offered the lead, a
+/// cell a moment before the edge is ready for it, and a cell after a split.
 fn settled(nodes: usize) -> Vec<Cell> {
     let cold = Cell::new(nodes);
     let mut quiet = cold.clone();

@@ -49,7 +49,7 @@ fn undisturbed_cell_has_best_leader() {
     });
 }
 
-/// Prints the gaps of all seeds; none may be longer than `most_us`.
+/// Prints the gaps of all seeds; each gap must be at most `most_us`.
 fn are_bounded(what: &str, most_us: u64, gap_of: impl Fn(u64) -> Option<u64>) {
     let mut gaps = Vec::new();
     for_seeds(seeds() / 10, |seed| {
@@ -78,8 +78,8 @@ fn silent_leader_replaced_in_400_ms() {
     are_bounded("silent", 400 * MS, |seed| failover_gap(seed, false, 1));
 }
 
-/// Whoever a split cuts off from the leader is served by a leader of its own within 400 ms, wherever the standby is;
-/// and the sides become one without a quarrel.
+/// Nodes that a split cuts off from the leader are served by a leader of their side within 400 ms, wherever the standby
+/// is; after the split both sides unite without further changes of leader.
 #[test]
 fn leaderless_side_recovers_in_400_ms() {
     are_bounded("split", 400 * MS, split_gap);
@@ -285,7 +285,7 @@ fn leader_with_broken_part_yields() {
                 world.run_for(9 * SECOND);
                 let leader = world.leaders()[0];
                 world.plan(0, fault(leader, false));
-                // Rounds are missed for 2.3 s, answers for 1 s; then a look finds it out.
+                // Rounds are missing for 2.3 s and answers for 1 s; then a query detects the failure.
                 world.run_for(3 * SECOND);
                 ensure(
                     world.leaders().len() == 1 && world.leaders()[0] != leader,
@@ -302,13 +302,14 @@ fn leader_with_broken_part_yields() {
     });
 }
 
-/// Evidence about vehicles is counted once, and what any candidate knows when the faults end all know soon.
+/// Evidence about vehicles is counted once, and soon after the end of the faults all candidates have the evidence that
+/// any candidate has.
 #[test]
 fn evidence_is_counted_exactly_once() {
     evidence_survives(false);
 }
 
-/// The same in cells with certificates, of what a candidate passes on: leaderships of some seconds may be forgotten.
+/// The same in cells with certificates for evidence that a candidate forwards; leaderships of some seconds may be lost.
 #[test]
 fn signed_evidence_is_counted_once() {
     evidence_survives(true);
@@ -329,7 +330,7 @@ fn evidence_survives(signed: bool) {
         }
         let leaders_end = world.random.between(6 * SECOND, 10 * SECOND);
         world.run_for(leaders_end);
-        // Only some candidates have heard of their last counts.
+        // Only some candidates have received their last counts.
         for leader in world.leaders() {
             world.plan(
                 0,
@@ -344,7 +345,8 @@ fn evidence_survives(signed: bool) {
         check(&mut world, seed, |world| {
             world.run_for(MS);
             let known = world.known_evidence();
-            // The leader is settled after 12 s, shares all it knows, and is told what it did not share.
+            // The leader is settled after 12 s, shares all its evidence, and receives the evidence that it did not
+            // share.
             world.run_for(15 * SECOND);
             let known_in_peace = world.known_evidence();
             world.run_for(25 * SECOND);
@@ -355,11 +357,12 @@ fn evidence_survives(signed: bool) {
     });
 }
 
-/// Whoever is named standby and leaves, or is killed, is not named for long, and no message goes to it for ever.
+/// A standby that leaves or is killed is replaced soon, and messages to it end.
 #[test]
 fn departed_standby_is_not_named() {
     for_seeds(seeds() / 10, |seed| {
-        // Of an unseen one, from when the leader's membership has found out, and says so within 300 ms.
+        // If the failure was not observed: from the leader's membership event on, and the leader publishes the change
+        // within 300 ms.
         for (fault, is_unseen, patience) in [
             (Fault::Leave as fn(usize) -> Fault, false, 60 * MS),
             (unseen_kill, true, 750 * MS),
@@ -510,7 +513,7 @@ fn plan_fault(world: &mut World, nodes: usize) {
     }
 }
 
-/// All links work, nothing is lost, and everyone but perhaps one node is there.
+/// All links work without loss, and all nodes except at most one are present.
 fn end_faults(world: &mut World) {
     world.plan(0, Fault::Heal);
     world.plan(0, Fault::Loss(0));

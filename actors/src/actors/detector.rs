@@ -7,7 +7,7 @@
 //! ```
 //!
 //! The pump takes the latest frame only when the detector is done with the previous one, so frames
-//! never queue.
+//! do not queue.
 
 use std::pin::pin;
 use std::sync::Arc;
@@ -43,7 +43,7 @@ pub struct DetectorArguments {
     pub capture: CaptureConfig,
     /// The detection algorithm.
     pub detect: Box<dyn Detect>,
-    /// The camera's lens, to whose image size detections are scaled.
+    /// The camera's lens. Detections are scaled to the image size of this lens.
     pub lens: Lens,
     /// Receiver of the detections.
     pub projector: ActorSlot<ProjectorMessage>,
@@ -55,7 +55,7 @@ pub struct DetectorArguments {
     pub troubles: CameraTroubles,
     /// Counters of the node.
     pub counters: Arc<Counters>,
-    /// The spans of the vehicle's present node.
+    /// Spans of the node in the vehicle's current cell.
     pub spans: watch::Receiver<Spans>,
     /// Age from which a report is refused.
     pub max_age: Duration,

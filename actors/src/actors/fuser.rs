@@ -121,7 +121,8 @@ impl Actor for Fuser {
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
-                // Includes reports that only the earlier run was notified of.
+                // Drains the queue: after a restart it may contain reports whose notification the
+                // former run consumed.
                 state.take_reports();
                 state.tick();
             }
@@ -161,8 +162,8 @@ impl Actor for Fuser {
     }
 }
 
-/// Time for which reports must be refused because of their time before this is a trouble: a stalled
-/// link only affects one or two reports.
+/// A trouble is shown if reports are refused as untimely for this long; a stalled link only affects
+/// one or two reports.
 const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 
 /// Lead or delay of an accepted report, in microseconds, from which its sender's clock must be

@@ -341,7 +341,7 @@ impl ReputationKeeperState {
             clock::now(),
         );
         if passed.is_news {
-            tracing::debug!("what a leader tells of itself is no longer on trial");
+            tracing::debug!("probation of a leader's evidence about itself has ended");
             self.writer.note_change();
             self.unadopted = true;
         }

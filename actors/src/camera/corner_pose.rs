@@ -20,7 +20,7 @@ pub enum CornerPoseError {
 ///
 /// `corners` are undistorted pixels in the order of [`ecod::model::detection::Detection::corners`];
 /// `side_m` is the length of a side. Infinitesimal plane-based pose estimation finds two poses
-/// (Collins and Bartoli 2014, OpenCV's `SOLVEPNP_IPPE_SQUARE`). The result is the one that faces
+/// (Collins and Bartoli 2014, OpenCV's `SOLVEPNP_IPPE_SQUARE`). The result is the pose that faces
 /// the camera with the smaller reprojection error.
 ///
 /// # Errors

@@ -64,7 +64,7 @@ pub enum DetectError {
         /// Count of labels.
         labels: usize,
     },
-    /// The model's outputs are not those of its family.
+    /// The model's outputs do not match its family.
     #[error(
         "the outputs of the model contradict the family {family}: {what}; set `family` and `first_class`, or export the model as docs/cameras.md lists"
     )]

@@ -66,7 +66,7 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     limits.reserve(decoder.total_bytes())?;
     let orientation = decoder.orientation()?;
     let mut image = DynamicImage::from_decoder(decoder)?;
-    // The decoder fills what is missing with gray.
+    // The decoder fills missing parts with gray.
     if is_jpeg && !has_end_of_image(bytes) {
         return Err(ImageError::CutOff);
     }

@@ -49,7 +49,7 @@ pub(super) fn directory() -> &'static Path {
     })
 }
 
-/// The configuration for a command: the given file, or else that of this machine's node, if there
+/// The configuration for a command: the given file, or else the file of this machine's node, if there
 /// is one. A file that was not given is named on standard error.
 pub(super) fn configuration(given: Option<&Path>) -> Option<PathBuf> {
     given

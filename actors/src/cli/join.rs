@@ -248,7 +248,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
     .into())
 }
 
-/// Gets and keeps the files of an invited node, or new certificates for one that has joined before.
+/// Gets and keeps the files of an invited node, or new certificates for a node that has joined before.
 pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
     let token = read_token(&arguments.token).map_err(Failure::usage)?;
     let directory = arguments.node.directory.directory()?;

@@ -43,7 +43,7 @@ pub fn read_line(
     Ok(LineRead::Whole)
 }
 
-/// Byte order marks of UTF-16, whose lines cannot be told from others by a byte.
+/// Byte order marks of UTF-16. UTF-16 text has no single-byte line end.
 const WIDE_MARKS: [&[u8]; 2] = [b"\xff\xfe", b"\xfe\xff"];
 
 /// Opens a file to read, after a byte order mark.
@@ -93,7 +93,10 @@ pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<
     };
     let ours = file(path);
     if ours.is_some() && inputs.iter().any(|input| file(input.as_ref()) == ours) {
-        bail!("{} is to be both read and written", path.display());
+        bail!(
+            "{} is both input and output; choose another output file",
+            path.display()
+        );
     }
     Ok(())
 }
@@ -127,7 +130,10 @@ mod tests {
                 .err()
                 .unwrap()
                 .to_string();
-            assert!(error.ends_with("is to be both read and written"), "{error}");
+            assert!(
+                error.ends_with("is both input and output; choose another output file"),
+                "{error}"
+            );
         }
         let mut line = String::new();
         open(&read).unwrap().read_line(&mut line).unwrap();

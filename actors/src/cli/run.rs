@@ -123,7 +123,7 @@ fn continue_without_opencv() {
         let error = Command::new(&program)
             .args(std::env::args_os().skip(1))
             .exec();
-        tracing::warn!(program = %program.display(), %error, "cannot run the program without OpenCV; this one goes on, with more memory");
+        tracing::warn!(program = %program.display(), %error, "cannot start the smaller program without OpenCV; continuing with this one, which uses more memory");
     }
 }
 
@@ -213,9 +213,7 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     #[cfg(feature = "camera")]
     if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
-        tracing::warn!(
-            "no [camera] is configured: of this vehicle, only programs beside it report"
-        );
+        tracing::warn!("no [camera] is configured: only other programs of this vehicle can report");
     }
     let variables = variables_without_key();
     if !variables.is_empty() {

@@ -28,7 +28,7 @@ pub enum FuserMessage {
         /// Time of receipt.
         received_at: Timestamp,
     },
-    /// Do not continue from a map of this node, and remove what it alone has reported: its
+    /// Do not continue from a map of this node, and remove objects that it alone has reported: its
     /// certificate was revoked or has expired.
     Expel {
         /// The node.

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use ecod::model::names::NodeName;
 use ractor::RpcReplyPort;
 
-/// End of one step of a renewal, which was done beside the membership.
+/// Result of a renewal step that ran in a separate task.
 #[derive(Debug)]
 pub enum RenewalOutcome {
     /// This node has decided about another node's request.

@@ -10,7 +10,7 @@ use crate::transport::mqtt::{Delivery, FromRegion, LinkEvent};
 /// Messages to the uplink.
 #[derive(Debug)]
 pub enum UplinkMessage {
-    /// Check the leader and the newest map: one of them has changed.
+    /// Check the leader and the newest map, because the leader or the map has changed.
     Look,
     /// Publish this status of the node while it leads.
     SetStatus {

@@ -465,7 +465,7 @@ fn slot<M: Message>(
     Ok(id)
 }
 
-/// As `slot`, for a part of one of the cameras.
+/// As `slot`, for a part of a camera.
 #[cfg(feature = "camera")]
 fn camera_slot<M: Message>(
     slots: &[ActorSlot<M>],

@@ -445,7 +445,7 @@ impl NodeConfig {
         self.serves_nodes() || self.broker.door
     }
 
-    /// True if the broker takes a free port where the usual one is in use: other nodes learn its
+    /// True if the broker takes a free port if the usual port is in use: other nodes receive its
     /// address from the membership.
     pub fn may_listen_at_any_port(&self) -> bool {
         self.listen.is_none()

@@ -1,7 +1,7 @@
 //! Presence of a node in its cell, and the parts that move along when a vehicle changes to another
 //! cell.
 //!
-//! A moving vehicle temporarily has two nodes: the present one, and a second one that prepares in
+//! A moving vehicle temporarily has two nodes: the present node, and a second node in preparation for
 //! the next cell. Cameras, poses, counters and addresses belong to the vehicle, and both nodes
 //! share them. Detectors keep running; the next node's projectors replace the projectors of the
 //! present node. A frame is therefore reported in one cell only.

@@ -244,7 +244,7 @@ enum Change {
     Failed(NodeError),
 }
 
-/// Waits for news of the next node; forever if there is none.
+/// Waits for news of the next node; forever without a next node.
 async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Change) {
     let Some((cell, node)) = next else {
         return std::future::pending().await;

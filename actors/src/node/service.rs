@@ -73,7 +73,7 @@ impl ServiceManager {
         if let Err(error) = &told
             && !self.failing
         {
-            tracing::warn!(%error, "service manager not told");
+            tracing::warn!(%error, "cannot notify the service manager");
         }
         self.failing = told.is_err();
     }

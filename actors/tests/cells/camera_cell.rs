@@ -64,7 +64,7 @@ async fn unbuildable_detector_names_reason() {
     );
 }
 
-/// Two cameras back to back report as one witness: the map has what is before and what is behind the vehicle.
+/// Two cameras back to back report as one witness: the map contains the objects in front of the vehicle and behind it.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_cameras_make_one_witness() {
     let folder = tempfile::tempdir().unwrap();
@@ -126,7 +126,7 @@ async fn two_cameras_make_one_witness() {
     node.stop().await;
 }
 
-/// The end comes as frame and as status; whichever is taken first, the node says so.
+/// The end arrives as a frame and as a status; the node logs it for either order.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_ended_source_is_trouble() {
     let photos = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");
@@ -158,7 +158,7 @@ async fn each_ended_source_is_trouble() {
         };
         timeout(Duration::from_secs(10), told)
             .await
-            .expect("the end is told");
+            .expect("the end is reported");
         node.stop().await;
     }
 }

@@ -53,7 +53,7 @@ fn label(map: &GlobalMap, slot: usize) -> Option<&str> {
     map.landmarks[slot].label.as_deref()
 }
 
-/// Has the reporter say what it sees until the receiver's newest map is as wanted.
+/// Makes the reporter publish its detections until the receiver's newest map meets the condition.
 async fn reported(
     reporter: &NodeHandle,
     receiver: &NodeHandle,
@@ -168,7 +168,7 @@ async fn cell_survives_any_part_loss() {
         let term = edge.leadership().borrow().epoch.clone().unwrap().term;
         kill();
         eprintln!("killed {part}");
-        // An election that starts anew has no state directory to tell it that the term is used.
+        // A new election has no state directory, so it does not have the used term.
         let is_fresh = |map: &GlobalMap| part != "election" || map.epoch > term;
         reported(&euclid, &euclid, sees(part), |map| {
             label(map, 2) == Some(part) && is_fresh(map)

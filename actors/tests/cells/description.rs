@@ -17,7 +17,7 @@ use tokio::time::{sleep, timeout};
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// A node of a cell whose other nodes gossip at `seeds`. Its own file says `toml`.
+/// A node of a cell whose other nodes gossip at `seeds`. Its configuration file contains `toml`.
 fn config(
     name: &str,
     role: Role,
@@ -196,7 +196,7 @@ fn reporting(name: &'static str, node: &NodeHandle) -> tokio::task::JoinHandle<(
     })
 }
 
-/// Votes of a vehicle that count as right, as a node knows of them.
+/// Votes of a vehicle that count as correct in the ledger of a node.
 fn right_votes(node: &NodeHandle, voter: &str) -> u64 {
     let newest = node.newest_reputations();
     let newest = newest.borrow();
@@ -272,7 +272,7 @@ async fn configuration_spreads_within_two_rounds() {
             now.objects.iter().any(|object| object.id == car),
             "the same track"
         );
-        assert_eq!(now.epoch, before.epoch, "nothing restarted");
+        assert_eq!(now.epoch, before.epoch, "no restart");
         let mut verdicts = gauss.newest_verdicts();
         let after = verdicts.wait_for(|newest| {
             newest
@@ -566,7 +566,7 @@ async fn contradicting_candidate_leads_last() {
         ],
     )
     .await;
-    // Longer than until the next look at its parts, of which it tells the leader.
+    // Longer than the time until the node checks its parts again and reports to the leader.
     sleep(Duration::from_secs(2)).await;
     edge.stop().await;
     map_where(&noether, "of euclid", |map| {

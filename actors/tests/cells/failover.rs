@@ -58,7 +58,7 @@ async fn maps_survive_edge_loss() {
     cell.stop().await;
 }
 
-/// Those that are left find a leader when the leader and the one named to follow it end together.
+/// The remaining nodes elect a leader if the leader and its standby end together.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn cell_survives_two_losses() {
     let mut cell = Cell::new(config);
@@ -81,7 +81,7 @@ async fn cell_survives_two_losses() {
     cell.stop().await;
 }
 
-/// A vehicle that finds nobody serves itself, and remembers its term when it starts again.
+/// A vehicle that finds no other node serves itself, and keeps its term across a restart.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn lone_vehicle_raises_its_epochs() {
     let mut cell = Cell::new(config);
@@ -124,7 +124,7 @@ async fn leader_without_part_yields() {
     cell.stop().await;
 }
 
-/// A leader whose broker falls silent makes way for one whose broker does not, and for nobody else.
+/// A leader whose broker stops answering hands over to a node whose broker answers, and only to such a node.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn leader_with_silent_broker_yields() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
@@ -158,7 +158,7 @@ async fn leader_with_silent_broker_yields() {
         assert_eq!(
             cell.leadership("gauss").position,
             Position::Leading,
-            "there is nobody to make way for"
+            "there is no other candidate for the lead"
         );
         assert_eq!(cell.leadership("gauss").epoch, epoch);
     }
@@ -169,7 +169,7 @@ async fn leader_with_silent_broker_yields() {
     cell.stop().await;
 }
 
-/// A vehicle of role `cav` follows whoever leads and never leads itself.
+/// A vehicle of role `cav` follows any leader and cannot lead.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn cav_follows_without_leading() {
     let mut cell = Cell::new(config);

@@ -1,4 +1,4 @@
-//! Troubles that a cell shows while things happen to it: each must name what happened, and nothing else may appear.
+//! Troubles that a cell shows during faults: each trouble must name the fault, and other troubles must not appear.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -281,7 +281,7 @@ async fn every_trouble_has_its_cause() {
     std::fs::write(&log, "a file").unwrap();
     watched
         .cell
-        .until("nothing is recorded", |_| {
+        .until("recording has stopped", |_| {
             watched.is_shown(["not_recorded", ""]).then_some(())
         })
         .await;

@@ -20,10 +20,10 @@ use tokio::time::{sleep, timeout};
 
 /// Long enough for a loaded machine.
 const SOON: Duration = Duration::from_secs(20);
-/// Where every node says that its broker listens.
+/// The broker address that every node states.
 const BROKER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 1883);
 
-/// A node's membership, as its tests look at it.
+/// A node's membership, as seen by its tests.
 struct Node(Member);
 
 /// A node on a free port of loopback, with a key, without multicast.
@@ -157,7 +157,7 @@ async fn datagrams_reach_other_nodes() {
         _ => false,
     };
     let arrived = async {
-        // One that waits for a session too long is lost.
+        // A message that waits for a session too long is lost.
         while !nodes[4].events().iter().any(received) {
             let to = nodes[4].name.clone();
             nodes[1]

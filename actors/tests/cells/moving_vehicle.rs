@@ -1,4 +1,5 @@
-//! Vehicles whose poses are received, or on Earth: what they see is placed from where they were, and put to the vote.
+//! Vehicles that receive their poses, or have poses on Earth: detections are placed relative to the pose at their
+//! capture, and used for votes.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::net::SocketAddr;
@@ -113,7 +114,7 @@ async fn moving_vehicle_uses_past_pose() {
     let vehicle = node::start(config).await.unwrap();
     let (_client, mut events) = onlooker(broker).await;
 
-    // Nobody has told it where it is: its frames say nothing.
+    // The vehicle has not received a pose, so it does not report its frames.
     let unplaced = async {
         while vehicle.counters().events(Event::FrameWithoutPose) < 3 {
             tokio::time::sleep(Duration::from_millis(20)).await;
@@ -292,7 +293,7 @@ async fn earth_poses_use_cell_origin() {
         }
     });
 
-    // Nobody has said where on Earth the cell is.
+    // The cell has no position on Earth.
     until("poses are refused", async || {
         driving.counters().events(Event::PoseRejected) > 3
     })
@@ -307,7 +308,7 @@ async fn earth_poses_use_cell_origin() {
         "no origin",
         "ecod-node cell set",
     ];
-    until("that is told", async || {
+    until("the trouble is reported", async || {
         let answer = readiness(&standing).await;
         told.iter().all(|part| answer.contains(part))
     })

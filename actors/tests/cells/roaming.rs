@@ -47,7 +47,7 @@ fn config(cell: usize, name: &str, role: Role) -> NodeConfig {
 /// Number of cells on the road.
 const CELLS: usize = 2;
 
-/// A city's CA, and those of its cells.
+/// The CA of a city, and the CAs of its cells.
 struct City {
     city: Authority,
     cells: Vec<Authority>,
@@ -165,9 +165,9 @@ impl Reports {
     }
 }
 
-/// Cells in which a vehicle drives, and what it needs for that.
+/// Cells of a moving vehicle, and their files for the vehicle.
 struct Town {
-    /// By cell; some have none.
+    /// By cell; some cells have none.
     edges: BTreeMap<usize, NodeHandle>,
     readers: JoinSet<()>,
     directory: TempDir,
@@ -322,7 +322,7 @@ impl Town {
     }
 }
 
-/// Tells the vehicle at 20 Hz where it is, heading east.
+/// Sends the vehicle's pose at 20 Hz, heading east.
 async fn localise(poses: SocketAddr, x_m: Arc<Mutex<f64>>) {
     let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     loop {
@@ -400,7 +400,11 @@ async fn vehicle_reports_in_one_cell() {
     assert!(missed <= 1, "{missed} maps missed");
     let left = first.count();
     second.more().await;
-    assert_eq!(first.count(), left, "the former cell hears no more of it");
+    assert_eq!(
+        first.count(),
+        left,
+        "the former cell receives no more reports"
+    );
     town.drive_to(0.0);
     first.more().await;
     let vehicle = vehicle.stop().await;

@@ -1,4 +1,4 @@
-//! A cell without known locations, on real sockets: what becomes of objects and of what vehicles say about them.
+//! A cell without landmarks, on real sockets: objects, and the vehicles' statements about them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -49,7 +49,7 @@ fn map(node: &NodeHandle) -> Option<Arc<GlobalMap>> {
         .map(|newest| Arc::clone(&newest.map))
 }
 
-/// The identities of what is surely there.
+/// The identities of the certain objects.
 fn ids(map: &GlobalMap) -> Vec<Uuid> {
     map.objects
         .iter()

@@ -56,7 +56,7 @@ async fn cav(node: &str, edge: &NodeHandle) -> NodeHandle {
     attached(node, Role::Cav, edge, |_| ()).await
 }
 
-/// A node that finds the cell by its gossip and uses the brokers of whoever leads.
+/// A node that finds the cell by its gossip and uses the brokers of the leader.
 async fn member(
     node: &str,
     role: Role,
@@ -84,7 +84,7 @@ fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
     })
 }
 
-/// Has two vehicles say cup and a third say dog, all over the third's connection to the broker.
+/// Makes two vehicles vote cup and a third vote dog, all over the third vehicle's connection to the broker.
 fn disagree(reporter: &NodeHandle) {
     for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
         let message = GatewayMessage::PublishReport {
@@ -119,7 +119,12 @@ async fn unmasked(reporter: &NodeHandle, receiver: &NodeHandle) {
         reputation(receiver, "liar").is_some_and(|liar| liar.incorrect >= 5)
             && reputation(receiver, "euclid").is_some_and(|euclid| euclid.correct >= 5)
     };
-    until("the liar unmasked", || disagree(reporter), settled).await;
+    until(
+        "the malicious vehicle is detected",
+        || disagree(reporter),
+        settled,
+    )
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -177,11 +182,13 @@ async fn retained_reputations(edge: &NodeHandle) -> Reputations {
             }
         }
     };
-    let publish = timeout(PATIENCE, first).await.expect("nothing is retained");
+    let publish = timeout(PATIENCE, first)
+        .await
+        .expect("no message is retained");
     assert_eq!(
         publish.qos,
         rumqttc::QoS::AtMostOnce,
-        "an embedded broker holds nothing for acknowledgements"
+        "an embedded broker keeps no messages for acknowledgement"
     );
     decode(&publish.payload, &Default::default()).unwrap()
 }
@@ -289,7 +296,7 @@ async fn restarted_parts_keep_reputations() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn next_leader_keeps_reputations() {
     let edge = edge(|_| ()).await;
-    // It never settles a vote itself: what it knows, it was told.
+    // This node does not settle votes itself: all its evidence was received.
     let standby = member("standby", Role::Auto, &edge, |config| {
         config.fusion.vote.weighted.freshness_s = 1e9;
     })
@@ -303,14 +310,19 @@ async fn next_leader_keeps_reputations() {
                 .is_some_and(|l| l.incorrect >= 5)
         })
     };
-    until("the liar unmasked", || disagree(&euclid), settled).await;
+    until(
+        "the malicious vehicle is detected",
+        || disagree(&euclid),
+        settled,
+    )
+    .await;
     until(
         "evidence replicated",
         || disagree(&euclid),
         || standby.counters().events(Event::LedgerMerged) > 2,
     )
     .await;
-    // The last votes are settled and published when nothing new has come for a second, and the standby knows the same.
+    // The last votes are settled and published after a second without new votes, and the standby has equal evidence.
     let mut last = from_edge().unwrap();
     let mut since = Instant::now();
     let known = |node: &NodeHandle| reputations(node).map(|newest| newest.reputations.clone());
@@ -345,7 +357,7 @@ async fn next_leader_keeps_reputations() {
     )
     .await;
 
-    // A candidate that was not there before is told all.
+    // A candidate that joins later receives all evidence.
     let late = member("late", Role::Auto, &standby, |_| ()).await;
     let tell = || {
         standby

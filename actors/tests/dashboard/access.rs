@@ -1,4 +1,4 @@
-//! Who may look.
+//! Access to the page.
 
 use ecod::wire::Role;
 use ecod_actors::platform::secret::Secret;

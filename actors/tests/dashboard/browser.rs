@@ -22,8 +22,8 @@ const SHOWN: &str = "document.querySelectorAll('#map .place.full').length >= 6 \
 const IS_READY: &str =
     "/^(Live|No reports|[0-9]+ trouble)/.test(document.querySelector('#state-text')?.textContent)";
 
-/// The map of a cell of processes fills, a vehicle takes over when the edge's process is killed, and the page says so,
-/// also to those who do not see it. Leaves pictures of the page in `target/dashboard`.
+/// The map of a cell of processes fills, a vehicle takes over when the edge's process is killed, and the page reports
+/// it, also to screen readers. Leaves pictures of the page in `target/dashboard`.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn browser_follows_new_leader() {
@@ -132,7 +132,7 @@ async fn browser_follows_new_leader() {
         .await;
     assert_eq!(
         said, "Connection lost",
-        "and nothing that changes every second"
+        "and no text that changes every second"
     );
     let chart = browser
         .evaluate("Number(getComputedStyle(document.querySelector('#latency-chart')).opacity)")
@@ -145,8 +145,8 @@ async fn browser_follows_new_leader() {
     println!("pictures of the page: {}", pictures.display());
 }
 
-/// A page of elsewhere may lead to one with a token. A page for which there is no live connection left follows slowly,
-/// and says so until others are closed.
+/// A page of another site may link to a page with a token. Without a free live connection, a page polls slowly, and
+/// states this until other pages are closed.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn link_signs_in_excess_page_polls() {
@@ -200,7 +200,7 @@ const WITHOUT_THE_LATEST: &str = "for (const [of, names] of [[Map, ['groupBy']],
     [Array.prototype, ['findLast', 'findLastIndex', 'toSorted', 'toReversed', 'toSpliced', 'with']], \
     [Promise, ['withResolvers']], [Set.prototype, ['union', 'difference']]]) for (const name of names) delete of[name];";
 
-/// Browsers of some years ago show the map, and where something cannot be drawn the page does not look well.
+/// Browsers of some years ago show the map. If a part cannot be drawn, the page shows a fault.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn old_browser_shows_map_or_explains() {
@@ -238,7 +238,8 @@ async fn old_browser_shows_map_or_explains() {
     node.stop().await;
 }
 
-/// Tables that are cut off, below or at the right, show a shadow where they go on, and none where they end.
+/// Tables that are cut off, below or at the right, show a shadow on the side that continues, and no shadow at their
+/// ends.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
@@ -332,7 +333,7 @@ const PLACES: &str = "[...document.querySelectorAll('.scroll')].filter((it) => i
 /// Far away from everything else, and a position all the same.
 const FAR_M: f64 = 9e7;
 
-/// A vehicle that is told a wrong pose does not rule the map. It is pointed to, and shown on demand.
+/// A vehicle with a wrong pose does not determine the scale of the map. The page points to it and shows it on request.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn wrong_position_distorts_no_map() {
@@ -351,7 +352,7 @@ async fn wrong_position_distorts_no_map() {
     assert_eq!(
         browser.evaluate(&format!("{width} > 300")).await,
         true,
-        "a vehicle that sees nothing rules nothing"
+        "a vehicle without detections does not scale the map"
     );
     stray.report(FAR_M, 1.0).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
@@ -403,7 +404,7 @@ async fn wrong_position_distorts_no_map() {
     node.stop().await;
 }
 
-/// A finger scrolls past the whole map, and moves one that is zoomed; all of it is shown again by Fit.
+/// A finger scrolls past a map that is shown whole, and moves a map that is zoomed; Fit shows the whole map again.
 async fn finger(browser: &Browser) {
     browser.look(390, 844, "light").await;
     let middle = async || {
@@ -470,7 +471,7 @@ async fn keyboard_and_table(browser: &Browser) {
         && !(e.textContent.trim() || e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')) \
         && !e.getAttribute('aria-hidden')).map((e) => e.outerHTML.slice(0, 80))";
     let nameless = browser.evaluate(nameless).await;
-    // The state before the first picture and a notice while all is well say nothing.
+    // The state before the first picture and a notice in normal operation contain no message.
     assert_eq!(
         nameless
             .as_array()

@@ -31,7 +31,7 @@ pub(crate) fn seeing(directory: &Path) -> NodeConfig {
     }
 }
 
-/// The same with a camera to the rear, before which a dog stands.
+/// The node with a second camera to the rear, which detects a dog.
 pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
     let mut both = seeing(directory);
     let mut rear = camera(
@@ -97,7 +97,11 @@ async fn pictures_need_viewers() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing(directory.path())).await;
     sees_objects(page).await;
-    assert_eq!(node.counters().events(Event::FrameShown), 0, "nobody looks");
+    assert_eq!(
+        node.counters().events(Event::FrameShown),
+        0,
+        "without a viewer"
+    );
 
     let mut pictures = Events::open_at(page, "/api/camera").await;
     let picture = pictures.next().await;
@@ -241,7 +245,7 @@ async fn box_and_object_highlight_together() {
     node.stop().await;
 }
 
-/// Each camera's pictures are of their own, and made while somebody looks at that camera.
+/// Each camera has separate pictures, which are made only while a reader views that camera.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn camera_name_selects_pictures() {
     let directory = tempfile::tempdir().unwrap();

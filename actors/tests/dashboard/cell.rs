@@ -16,7 +16,7 @@ use tokio::task::JoinSet;
 
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Configuration of a node with a page on a free port, which meets no cell of another test.
+/// Configuration of a node with a page on a free port, separated from the cells of other tests.
 pub(crate) fn config(name: &str, role: Role, landmarks: usize) -> NodeConfig {
     let landmark = |index: usize| {
         let (x_m, y_m) = place(index);
@@ -119,7 +119,7 @@ impl Stray {
             .await;
     }
 
-    /// Reports from a place in the east that there is nothing.
+    /// Reports an empty place from a pose in the east.
     pub(crate) async fn stand(&mut self, at_m: f64) {
         self.send(at_m, Vec::new()).await;
     }
@@ -163,7 +163,7 @@ async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
                 seq += 1;
                 for (kind, report) in reports(vehicle, seq, landmarks) {
                     let topic = format!("ecod/v1/lot/{kind}/{}", report.node);
-                    // A broker that is not there gets nothing.
+                    // An absent broker receives no messages.
                     let _ = client.try_publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json));
                 }
             }

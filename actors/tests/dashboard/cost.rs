@@ -1,4 +1,4 @@
-//! What a node with a page costs, as it says itself.
+//! Processor time and memory of a node with a page, by its own metrics.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -23,8 +23,8 @@ async fn usage(page: SocketAddr) -> [f64; 2] {
     })
 }
 
-/// An edge without camera that gets 32 reports of each kind ten times a second, with nobody looking and with one
-/// browser. The figures are of use from an optimised build only.
+/// An edge without camera that receives 32 reports of each kind ten times a second, without a browser and with one
+/// browser. Only the figures of an optimised build are useful.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a measurement: make test-dashboard"]
 async fn cost_with_32_vehicles() {

@@ -44,7 +44,7 @@ async fn only_host_page_shows_map() {
     browser
         .until("document.querySelectorAll('.place').length === 12")
         .await;
-    // Chromium takes every name below localhost for this machine; the door does not know it.
+    // Chromium resolves every name below localhost to this machine; the door rejects such names.
     browser
         .open(&format!("http://elsewhere.localhost:{port}/{query}"))
         .await;

@@ -1,4 +1,4 @@
-//! Whether machines are told the truth about the node.
+//! Health checks for machines are correct.
 
 use std::net::TcpListener;
 
@@ -100,7 +100,7 @@ async fn default_pages_are_loopback_only() {
     }
     assert_ne!(
         second, DEFAULT_ADDRESS,
-        "the first has it, or whoever had it before"
+        "the first node has the port, or its former user"
     );
     assert_eq!(other.counters().events(Event::DashboardNotBound), 0);
     one.stop().await;

@@ -36,7 +36,7 @@ impl Answer {
     }
 }
 
-/// One request on a connection of its own, as a browser on this machine would make it.
+/// One request on a separate connection, as a browser on this machine would make it.
 pub(crate) async fn get(address: SocketAddr, path: &str) -> Answer {
     get_with(address, path, &[("Host", "localhost")]).await
 }

@@ -1,4 +1,4 @@
-//! Browsers that behave badly cost the cell nothing.
+//! Browsers that misbehave do not disturb the cell.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -33,7 +33,7 @@ async fn longest_gap<T>(node: &NodeHandle, during: impl Future<Output = T>) -> (
     }
 }
 
-/// Far more than a round's period, far less than what a cell that waits for its browsers would take.
+/// Far longer than a round's period, far shorter than the delay of a cell that waits for its browsers.
 const MOST: Duration = Duration::from_secs(2);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -78,7 +78,7 @@ async fn non_reading_browsers_are_dropped() {
         reader.next().await;
     })
     .await;
-    println!("longest time between two maps beside 8 browsers that never read: {gap:?}");
+    println!("longest time between two maps with 8 browsers that do not read: {gap:?}");
     assert!(gap < MOST, "{gap:?}");
     node.stop().await;
 }
@@ -98,13 +98,13 @@ async fn browser_message_flood_is_limited() {
         }
     })
     .await;
-    println!("longest time between two maps beside 10,000 requests: {gap:?}");
+    println!("longest time between two maps with 10,000 requests: {gap:?}");
     assert!(gap < MOST, "{gap:?}");
     assert!(node.counters().events(Event::BrowserThrottled) > 1000);
     assert_eq!(
         get(page, "/healthz").await.status,
         200,
-        "health is told all the same"
+        "health is still answered"
     );
     until("pages are served again", || async {
         get(page, "/").await.status == 200
@@ -120,7 +120,7 @@ async fn flood(page: SocketAddr, requests: usize) {
     }
 }
 
-/// Whoever does not know the token takes no answers from those who do.
+/// Requests without the token do not take answers from requests with it.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn tokenless_flood_delays_no_user() {
     let mut config = config("euclid", Role::Auto, 1);
@@ -176,7 +176,7 @@ async fn silent_connections_are_displaced() {
     node.stop().await;
 }
 
-/// A page looks at live pictures and asks for more now and then, on connections that browsers would keep.
+/// A page receives live pictures and sends further requests now and then, on connections that browsers would keep.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pages_leave_room_for_scrapers() {
     let mut config = config("euclid", Role::Auto, 1);

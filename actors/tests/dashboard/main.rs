@@ -1,4 +1,4 @@
-//! A node's page, metrics and health, asked for over real sockets.
+//! A node's page, metrics and health, requested over real sockets.
 
 mod access;
 mod browser;

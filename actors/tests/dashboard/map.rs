@@ -58,7 +58,7 @@ fn watch(broker: std::net::SocketAddr) -> JoinSet<()> {
                     ..ObjectReport::new(node, seq, clock::now())
                 };
                 let topic = format!("ecod/v1/lot/detections/{name}");
-                // A broker that is not there gets nothing.
+                // An absent broker receives no messages.
                 let _ = client.try_publish(
                     topic,
                     QoS::AtMostOnce,
@@ -121,7 +121,7 @@ async fn far_object_is_indicated() {
         .await;
     browser.until(&format!("{WIDTH} > 300")).await;
 
-    // Details of what is pointed at.
+    // Details of the object at the pointer.
     browser
         .evaluate("document.querySelector('#map g[aria-label^=cup] .centre').id = 'cup'")
         .await;
@@ -218,7 +218,7 @@ async fn far_object_is_indicated() {
     node.stop().await;
 }
 
-/// Terms are explained to those who point, to those who use keys, and to those who listen.
+/// Explanations of terms are available by pointer, by keyboard, and by screen reader.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn terms_are_explained() {
@@ -389,7 +389,7 @@ async fn floor_plan_lies_under_map() {
     node.stop().await;
 }
 
-/// A node whose floor plan cannot be shown does not start, and says why.
+/// A node whose floor plan cannot be shown does not start, and prints the reason.
 #[tokio::test]
 async fn invalid_floor_plan_stops_start() {
     let directory = tempfile::tempdir().unwrap();

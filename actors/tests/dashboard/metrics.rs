@@ -88,7 +88,7 @@ async fn metrics_describe_node_activity() {
     node.stop().await;
 }
 
-/// Sums over nodes must be over those of one cell.
+/// Sums over nodes must be restricted to one cell.
 #[test]
 fn grafana_shows_one_cell() {
     let text = include_str!("../../../packaging/grafana/ecod.json");
@@ -127,7 +127,7 @@ fn grafana_shows_one_cell() {
     }
 }
 
-/// The page has words for everything that is counted and is not as it should be, and Grafana shows it and nothing else.
+/// The page has a text for every counter of abnormal events, and Grafana shows exactly these counters.
 #[test]
 fn every_loss_counter_is_displayed() {
     const USUAL: [Event; 18] = [
@@ -182,7 +182,7 @@ fn every_loss_counter_is_displayed() {
     assert_eq!(asked.split('|').collect::<BTreeSet<_>>(), left_out);
 }
 
-/// A value that many ask for is read once.
+/// A value that many clients request is read once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn concurrent_scrapes_get_equal_values() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;
@@ -203,7 +203,7 @@ async fn concurrent_scrapes_get_equal_values() {
     node.stop().await;
 }
 
-/// The metrics that a file asks for.
+/// The metrics that a file queries.
 fn names(file: &str) -> Vec<&str> {
     let words = file.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
     words

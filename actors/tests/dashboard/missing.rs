@@ -106,7 +106,7 @@ async fn crashed_node_stays_missing() {
         "{said}"
     );
     for page in pages {
-        until("nothing is missing", || async {
+        until("no node is missing", || async {
             missing(page).await.is_empty()
         })
         .await;
@@ -118,7 +118,7 @@ async fn crashed_node_stays_missing() {
     cell.stop().await;
 }
 
-/// `ecod-node cell dismiss` at a node's door: whether it succeeded, and what it printed.
+/// `ecod-node cell dismiss` at a node's door: whether it succeeded, and its output.
 async fn dismiss(door: SocketAddr, node: &'static str) -> (bool, String) {
     let run = move || {
         let mut program = command(env!("CARGO_BIN_EXE_ecod-node"));

@@ -75,7 +75,7 @@ async fn every_node_page_shows_cell() {
     cav.stop().await;
 }
 
-/// Neither the edge nor a plain client can be told of any more by the broker that died with the edge.
+/// The broker that ended with the edge cannot report the departure of the edge and of a plain client.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn dead_brokers_clients_are_removed() {
     let directory = tempfile::tempdir().unwrap();
@@ -134,7 +134,7 @@ async fn say_there_is(name: &'static str, broker: SocketAddr) {
     }
 }
 
-/// A vehicle's report reaches a node that only follows while someone looks there, and no longer.
+/// A vehicle's report reaches a following node only while a reader views it there.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn unviewed_follower_receives_no_reports() {
     let (edge, _) = start(config("edge", Role::Edge, 6)).await;
@@ -213,7 +213,7 @@ async fn history_lists_leaders_and_gaps() {
         "{history}"
     );
     assert!(history["failovers"].as_u64() >= Some(1), "{history}");
-    until("the edge's end is told", || async {
+    until("the edge's end is shown", || async {
         let history = get(page, "/api/history").await.json();
         history["events"]
             .as_array()

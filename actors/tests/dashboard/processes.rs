@@ -28,7 +28,7 @@ pub(crate) struct Place {
     pub(crate) gossip: SocketAddr,
 }
 
-/// Addresses on which nothing listens now.
+/// Addresses without a listener at present.
 pub(crate) fn free_places<const N: usize>() -> [Place; N] {
     let tcp = || TcpListener::bind("127.0.0.1:0").unwrap();
     let held = [(); N].map(|()| (tcp(), tcp(), UdpSocket::bind("127.0.0.1:0").unwrap()));

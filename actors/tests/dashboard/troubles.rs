@@ -23,7 +23,8 @@ use uuid::Uuid;
 use crate::cell::{config, join, start, until};
 use crate::http::get;
 
-/// A client that sends one report after the other, made by its number; ends when dropped. Its id is that of a node's run.
+/// A client that sends reports one after the other, each made from its number; it ends when dropped. Its id has the
+/// form of a node's run.
 fn send(
     broker: SocketAddr,
     node: &'static str,
@@ -55,7 +56,7 @@ fn report(node: &str, seq: u64, ahead_s: u64, x_m: &str) -> String {
     )
 }
 
-/// Troubles on the page of a node: subject, kind and cause, each with who tells it.
+/// Troubles on the page of a node: subject, kind and cause, each with the reporting node.
 async fn told(page: SocketAddr) -> Vec<[String; 4]> {
     let picture = get(page, "/api/picture").await.json();
     let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
@@ -74,8 +75,8 @@ async fn until_told(page: SocketAddr, expected: [&str; 3], cause: &str) {
     .await;
 }
 
-/// A client whose reports cannot be read and one whose clock is off are named with field and figure, on every page of the
-/// cell and in the metrics; and they are forgotten when they are gone.
+/// A client whose reports cannot be read and a client whose clock is off are named with field and figure, on every page
+/// of the cell and in the metrics. Their entries disappear after the clients have left.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn leader_troubles_reach_every_page() {
     let (edge, edge_page) = start(config("edge", Role::Edge, 2)).await;
@@ -103,14 +104,14 @@ async fn leader_troubles_reach_every_page() {
         "{metrics}"
     );
     drop((watson, late));
-    until("both are forgotten", || async {
+    until("both entries are removed", || async {
         told(edge_page).await.is_empty() && told(page).await.is_empty()
     })
     .await;
     stop([cav, edge]).await;
 }
 
-/// A vehicle whose reports the leader refuses knows it, and is not ready.
+/// A vehicle whose reports the leader refuses reports this trouble, and is not ready.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn refused_reports_make_vehicle_unready() {
     let (edge, _) = start(config("edge", Role::Edge, 2)).await;
@@ -125,7 +126,7 @@ async fn refused_reports_make_vehicle_unready() {
     until_told(
         page,
         ["euclid", "", "reports_refused"],
-        "edge says of this node: report rejected: objects[0].x_m",
+        "reported by edge: report rejected: objects[0].x_m",
     )
     .await;
     let ready = get(page, "/readyz").await;
@@ -134,7 +135,7 @@ async fn refused_reports_make_vehicle_unready() {
         ready.json()["reason"]
             .as_str()
             .unwrap()
-            .starts_with("edge says of this node"),
+            .starts_with("reported by edge"),
         "{}",
         ready.body
     );
@@ -146,19 +147,19 @@ async fn refused_reports_make_vehicle_unready() {
     stop([cav, edge]).await;
 }
 
-/// A node that finds nobody says what it heard instead, also where a service manager asks.
+/// A node that finds no other node shows the datagrams that it received instead, also to a service manager.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn who_is_alone_says_why() {
     let (edge, _) = start(config("edge", Role::Edge, 1)).await;
     let mut misspelt = config("euclid", Role::Cav, 1);
     misspelt.cell = NodeName::from_static("lott");
     let (cav, page) = join(misspelt, &edge).await;
-    // The edge hears the greetings of a seed; it does not greet itself.
+    // The edge receives the greetings of a seed without greeting others.
     until("the edge names the other cell", || async {
         let troubles = edge.troubles();
-        troubles
-            .iter()
-            .any(|(_, trouble)| trouble.cause == "heard cell lott from 127.0.0.1, this is lot")
+        troubles.iter().any(|(_, trouble)| {
+            trouble.cause == "received a datagram of cell lott from 127.0.0.1; this node is in lot"
+        })
     })
     .await;
     let mut unresolved = config("gauss", Role::Cav, 1);
@@ -243,7 +244,8 @@ async fn refusing_broker_is_named() {
     node.stop().await;
 }
 
-/// A vehicle that is shown gray frames of this size, and detects in each what is recorded; `more` are further keys of its camera.
+/// A vehicle that receives gray frames of this size, and detects the recorded objects in each frame; `more` are further
+/// keys of its camera.
 #[cfg(feature = "camera")]
 fn watching(
     name: &str,
@@ -272,7 +274,7 @@ fn watching(
     }
 }
 
-/// A camera that is not there, one whose pose nobody sends, and one that sees what has no size.
+/// An absent camera, a camera without a pose, and a camera that detects objects without a size.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn missing_camera_settings_are_named() {
@@ -320,7 +322,7 @@ async fn unplaced_detections_name_reason() {
     node.stop().await;
 }
 
-/// A camera that looks 6° higher than its mount says, at people who stand 4 to 15 m away.
+/// A camera whose real pitch is 6° above its configured mount, and people 4 to 15 m away.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn turned_camera_names_angle() {

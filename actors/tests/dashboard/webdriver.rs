@@ -68,7 +68,7 @@ impl Browser {
         browser
     }
 
-    /// Runs a script in every page before those of the page itself.
+    /// Runs a script in every page before the scripts of the page.
     pub(crate) async fn prepare(&self, script: &str) {
         self.chromium(
             "Page.addScriptToEvaluateOnNewDocument",
@@ -161,7 +161,7 @@ impl Browser {
         }
     }
 
-    /// Presses a key on what has the focus.
+    /// Presses a key on the focused element.
     pub(crate) async fn press(&self, key: &str) {
         for kind in ["keyDown", "keyUp"] {
             let code = if key == "Tab" { 9 } else { 0 };
@@ -215,7 +215,7 @@ impl Browser {
             .collect()
     }
 
-    /// The page as it looks now must not scroll sideways.
+    /// The page in its present state must not scroll sideways.
     pub(crate) async fn fits_the_width(&self, what: &str) {
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
         assert_eq!(

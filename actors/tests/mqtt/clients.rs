@@ -1,5 +1,5 @@
-//! Plain MQTT clients against a live cell, as the documentation tells them: mosquitto's tools. The client in Python has tests of
-//! its own, `make python-client-check`.
+//! Plain MQTT clients against a live cell, as in the documentation: mosquitto's tools. The client in Python has
+//! separate tests, `make python-client-check`.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
 use ecod_testkit::node_config;
 
-/// An edge of the cell that the documentation speaks of.
+/// An edge of the cell that the documentation uses.
 async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
     let config = NodeConfig {
         landmarks: vec![

@@ -1,4 +1,4 @@
-//! Programs beside nodes: whoever leads, each takes part in the cell at its own node's broker.
+//! Programs next to nodes: with any leader, each program participates in the cell at its own node's broker.
 
 mod boxes;
 mod cell;
@@ -158,7 +158,7 @@ async fn any_broker_port_accepts_detector() {
 async fn leader_and_standby_get_report_once() {
     let cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
-    // Each aggregator counts what it rejects by sender.
+    // Each aggregator counts rejected reports by sender.
     let report = br#"{"schema":1,"node":"euclid--lidar","seq":1,"captured_at_us":1,"objects":[]}"#;
     assert_eq!(
         lidar
@@ -199,7 +199,7 @@ async fn program_receives_all_messages() {
             Program::connect("display", cell.door(name), &filters).await,
         ));
     }
-    // A report reaches a door as soon as its node has asked the leader's broker for reports.
+    // A report reaches a door as soon as its node has subscribed to reports at the leader's broker.
     let heard = |display: &Program, topic: &str| !display.heard_on(topic).is_empty();
     let probed = async {
         for seq in 0.. {
@@ -453,7 +453,7 @@ async fn external_broker_keeps_broker_port() {
         assert_eq!(
             cell.node(name).broker_address(),
             None,
-            "no node is told of a door"
+            "no node receives the address of a door"
         );
         let program = Program::connect("lidar", cell.door(name), &["global_detections"]).await;
         reported(

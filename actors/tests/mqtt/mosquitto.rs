@@ -29,7 +29,7 @@ impl Mosquitto {
         Self::configured(|directory| passwords(directory, user, password))
     }
 
-    /// Admits only this user, who may then do what the list says.
+    /// Admits only this user, with the rights in the list.
     pub(crate) fn with_permissions(user: &str, password: &str, permissions: &str) -> Self {
         Self::configured(|directory| {
             let file = directory.join("permissions");

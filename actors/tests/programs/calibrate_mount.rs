@@ -274,7 +274,7 @@ fn people_give_height_and_tilt() {
         stderr(&output)
     );
     let found = printed(&output);
-    assert_eq!(found[..3], [0.0; 3], "people say nothing of these");
+    assert_eq!(found[..3], [0.0; 3], "people do not determine these values");
     assert!(
         (found[3] / 3.5 - 1.0).abs() < 0.08
             && (found[4] - 18.0).abs() < 1.0

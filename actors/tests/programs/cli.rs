@@ -1,4 +1,4 @@
-//! The program as a newcomer meets it: what it accepts, what it prints, and what it says when something is wrong.
+//! The program as a newcomer uses it: its arguments, its output, and its errors.
 
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Command, Output, Stdio};
@@ -490,7 +490,10 @@ fn cameraless_vehicle_expects_program_reports() {
     node.stdin(Stdio::piped()).stderr(Stdio::piped());
     let mut node = node.spawn().unwrap();
     let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
-    assert!(log.any(|line| line.unwrap().contains("only programs beside it report")));
+    assert!(log.any(|line| {
+        line.unwrap()
+            .contains("only other programs of this vehicle can report")
+    }));
     drop(node.stdin.take());
     assert!(node.wait().unwrap().success());
 }
@@ -529,7 +532,7 @@ fn misplaced_command_names_its_program() {
     );
 }
 
-/// From nothing to a node with certificates, and what it says when they are another's.
+/// From an empty directory to a node with certificates, and its output for certificates of another node.
 #[test]
 fn certificate_commands_work() {
     let directory = tempfile::tempdir().unwrap();
@@ -602,7 +605,11 @@ fn stopped_node_resets_evidence() {
             .output()
             .unwrap()
     };
-    assert_eq!(reset(&[]).status.code(), Some(2), "says what to reset");
+    assert_eq!(
+        reset(&[]).status.code(),
+        Some(2),
+        "names the values for the reset"
+    );
     let cell = |name: &str| NodeName::new(name).unwrap();
     let running = StateFile::lock(directory.path(), &cell("lot"), &cell("edge")).unwrap();
     let refused = reset(&["--reputations"]);
@@ -633,7 +640,7 @@ fn stopped_node_resets_evidence() {
     );
 }
 
-/// As a package installs them: the program, and beside it one without OpenCV.
+/// The files of a package: the program, and the smaller program without OpenCV.
 #[test]
 fn cameraless_node_avoids_opencv() {
     let prefix = tempfile::tempdir().unwrap();

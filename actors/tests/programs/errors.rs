@@ -1,4 +1,4 @@
-//! What an operator reads about a configuration or a description that cannot be used: key, value, allowed values, remedy.
+//! The errors for a configuration or a description that cannot be used: key, value, allowed values, remedy.
 //!
 //! A change is accepted by `INSTA_UPDATE=always make snapshots`.
 
@@ -89,7 +89,7 @@ fn case(text: &str, error: &str) -> String {
     shown
 }
 
-/// What the program prints about a configuration.
+/// The program's output about a configuration.
 fn refused(text: &str) -> String {
     let directory = tempfile::tempdir().unwrap();
     std::fs::write(directory.path().join("node.toml"), text).unwrap();

@@ -1,4 +1,4 @@
-//! The configurations that the documentation hands out can be used as they are, and what it points to is there.
+//! The example configurations of the documentation work unchanged, and the files that they name exist.
 
 use std::collections::BTreeMap;
 #[cfg(feature = "camera")]
@@ -26,7 +26,7 @@ fn example_edge_aggregates_for_network() {
     assert!(edge.mqtt.broker.is_none());
 }
 
-/// `doctor`, which systemd does not start, looks at the directory that the service writes.
+/// `doctor`, which systemd does not start, checks the directory to which the service writes.
 #[test]
 fn packaged_node_uses_service_directory() {
     let node = load("../../packaging/debian/node.toml");
@@ -74,7 +74,11 @@ fn example_vehicles_fit_example_edge() {
                 .of("car")
                 .is_some()
         );
-        assert_eq!(vehicle.landmarks, [], "a node's own file shares nothing");
+        assert_eq!(
+            vehicle.landmarks,
+            [],
+            "a node's own file contains no shared settings"
+        );
         assert!(
             vehicle.broker_listen().ip().is_unspecified(),
             "the others reach its broker"

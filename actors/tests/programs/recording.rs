@@ -1,4 +1,4 @@
-//! Logs of live cells: what is in them, what outlives the process, and that they run again as it was.
+//! Logs of live cells: their content, their state after a kill, and replays that reproduce the original run.
 
 mod cell;
 mod disk;
@@ -21,7 +21,7 @@ use ecod_testkit::{Cell, name};
 
 use cell::{Log, config, drive};
 
-/// The lines that a replay of a node's log writes, and what it says.
+/// The lines and the messages of a replay of a node's log.
 fn replay(log: &std::path::Path) -> (Vec<FusedLine>, String) {
     let arguments = ["replay", "--input", log.to_str().unwrap(), "--output", "-"];
     let run = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
@@ -162,7 +162,7 @@ async fn each_run_keeps_its_configuration() {
     );
 }
 
-/// An observer's log has what all of the cell said, and the reports in it can be fused, also those of several runs.
+/// An observer's log has the messages of the whole cell, and its reports can be fused, also across several runs.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn observer_records_all_messages() {
     let mut cell = Cell::new(config);
@@ -193,7 +193,7 @@ async fn observer_records_all_messages() {
             .unwrap();
         let name = format!("edge--recorder-{}", observer.id());
         let mut observer = disk::Process(observer);
-        cell.until("the observer takes part", |cell| {
+        cell.until("the observer is a member", |cell| {
             cell.node("edge")
                 .members()
                 .borrow()

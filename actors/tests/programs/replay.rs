@@ -129,7 +129,8 @@ fn unusable_lines_count_by_reason() {
     }
 }
 
-/// A vote that names its location needs no position. Detections do: the field is named, and nothing used is a failure.
+/// A vote that names its landmark needs no position. A detection needs one: the error names the field, and a replay
+/// without any used report fails.
 #[test]
 fn named_votes_need_no_positions() {
     let line = |topic: &str| {
@@ -161,7 +162,8 @@ fn named_votes_need_no_positions() {
     );
 }
 
-/// Votes for locations that the configuration does not have, and positions in centimetres, are readable and change nothing.
+/// Votes for landmarks that the configuration does not have, and positions in centimetres, are readable and have no
+/// effect.
 #[test]
 fn reports_without_effect_fail() {
     let folder = TempDir::new().unwrap();

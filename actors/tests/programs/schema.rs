@@ -1,4 +1,4 @@
-//! The JSON Schemas in `docs/schemas` are those of the code, and `docs/asyncapi.yaml` has its topics.
+//! The JSON Schemas in `docs/schemas` match the code, and `docs/asyncapi.yaml` has its topics.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,4 @@
-//! A node as a service: what it tells the service manager, and what it logs.
+//! A node as a service: its notifications to the service manager, and its log.
 
 use std::io::{BufRead, BufReader, Read};
 use std::net::UdpSocket;
@@ -49,7 +49,7 @@ impl Service {
         }
     }
 
-    /// The next line that the node tells, if there is one until then.
+    /// The next notification of the node, if one arrives until then.
     fn hear(&self, until: Instant) -> Option<String> {
         let left = until
             .saturating_duration_since(Instant::now())
@@ -64,7 +64,7 @@ impl Service {
         )
     }
 
-    /// All that the node tells until it tells this.
+    /// All notifications of the node up to this one.
     fn hears(&self, wanted: &str) -> Vec<String> {
         let deadline = Instant::now() + PATIENCE;
         let mut heard = Vec::new();
@@ -107,8 +107,8 @@ fn free_port() -> u16 {
         .port()
 }
 
-/// The watchdog of a follower is fed while rounds of a live aggregator come, and of the aggregator while it leads; both
-/// say how they are, and the end is told.
+/// The watchdog of a follower is fed while rounds of a live aggregator arrive, and the watchdog of the aggregator while
+/// it leads; both notify their state and their end.
 #[test]
 fn watchdog_needs_rounds() {
     let gossip = format!("127.0.0.1:{}", free_port());
@@ -121,7 +121,7 @@ fn watchdog_needs_rounds() {
     assert_eq!(
         edge.hears("READY=1").len(),
         1,
-        "nothing is told before the node runs"
+        "the first notification comes when the node runs"
     );
     edge.hears("STATUS=leading");
     edge.hears("WATCHDOG=1");
@@ -141,7 +141,7 @@ fn watchdog_needs_rounds() {
     }
 }
 
-/// A supervisor that hangs feeds nothing, whatever the rest of the process may do.
+/// A supervisor that hangs does not feed the watchdog, even if the rest of the process works.
 #[test]
 fn stopped_node_feeds_no_watchdog() {
     let edge = Service::start(&["--role", "edge", "--listen", "127.0.0.1:0"]);
@@ -154,7 +154,7 @@ fn stopped_node_feeds_no_watchdog() {
     edge.hears("WATCHDOG=1");
 }
 
-/// Log of a node that is told to stop as soon as it serves.
+/// Log of a node that is stopped as soon as it serves.
 fn log(arguments: &[&str]) -> Vec<String> {
     let mut command = program();
     command
@@ -251,7 +251,7 @@ fn completions_and_manuals_cover_commands() {
     );
 }
 
-/// The unit starts the program that the package installs with the file that it installs, and waits to be told.
+/// The unit starts the installed program with the installed configuration, and waits for its notification.
 #[test]
 fn the_unit_fits_the_program() {
     let packaging = Path::new(env!("CARGO_MANIFEST_DIR")).join("../packaging");

@@ -31,7 +31,7 @@ impl Drop for Process {
     }
 }
 
-/// A directory in which `ecod/node.toml` describes a node with addresses of its own, and the address of its page.
+/// A directory in which `ecod/node.toml` describes a node with separate addresses, and the address of its page.
 fn machine(role: &str) -> (TempDir, SocketAddr) {
     let directory = tempfile::tempdir().unwrap();
     let tcp = || TcpListener::bind("127.0.0.1:0").unwrap();
@@ -64,7 +64,7 @@ fn start(directory: &Path) -> Process {
     Process(node)
 }
 
-/// True if root would use the files of an installed node instead of those of the test.
+/// True if root would use the files of an installed node instead of the files of the test.
 fn has_installed_node() -> bool {
     Path::new("/etc/ecod").exists()
 }
@@ -217,7 +217,8 @@ fn commands_use_local_node_files() {
     assert!(text(&without.stderr).contains("--config FILE"));
 }
 
-/// A person at a terminal learns what runs, where the page is and what comes next, and stops the node without warnings.
+/// At a terminal the program prints its state, the address of the page and the next step, and stops the node without
+/// warnings.
 #[test]
 fn log_begins_with_page() {
     let (directory, page) = machine("edge");

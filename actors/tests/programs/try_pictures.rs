@@ -1,4 +1,4 @@
-//! `ecod-node try` as a newcomer meets it: pictures in, objects on the map, no configuration.
+//! `ecod-node try` for a newcomer: pictures in, objects on the map, without a configuration.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -23,7 +23,7 @@ fn ecod_node() -> Command {
     command
 }
 
-/// A directory with this photograph as its only image, in a frame, so that nothing in it is cut.
+/// A directory with this photograph as its only image, in a frame, so that its objects are not cut.
 fn album(directory: &Path, photograph: &str) -> String {
     let album = directory.join(photograph);
     fs::create_dir(&album).unwrap();
@@ -166,7 +166,7 @@ fn two_cameras_make_one_map() {
     };
     assert!(
         std::iter::from_fn(next_line).any(|line| told(&line)),
-        "progress is told of"
+        "progress is printed"
     );
     for (label, page) in [("cat", &page), ("person", &second)] {
         assert!(
@@ -222,7 +222,7 @@ fn missing_source_shows_simulated_street() {
             .map(|name| name.as_str().unwrap())
             .eq(names.iter().copied())
     };
-    // A car that nobody but the camera on the mast sees, and a person whom both see.
+    // A car that only the camera on the mast detects, and a person that both cameras detect.
     let wanted = [
         ("car", vec!["kepler"]),
         ("person", vec!["galileo", "kepler"]),

@@ -116,8 +116,8 @@ fn set_matrix(mp4: &mut [u8], [a, b, c, d]: [i32; 4]) {
     mp4[at..at + bytes.len()].copy_from_slice(&bytes);
 }
 
-/// Sets the durations of frames, in those of the file's equal ones. The table is at the end of the
-/// file, so that nothing else moves.
+/// Sets the durations of frames, in units of the file's equal durations. The table is at the end of the file, so that
+/// the rest keeps its position.
 fn set_durations(mp4: &mut Vec<u8>, durations: &[u32]) {
     let table = place_of(mp4, b"stts");
     let old = mp4[table..table + 24].to_vec();
@@ -277,7 +277,7 @@ fn missing_pipeline_element_is_named() {
     assert!(!error.contains("hunter2"), "{error}");
 }
 
-/// A network camera on a free port that answers whoever asks as `answer` does; its address.
+/// A network camera on a free port that answers every client with `answer`; returns its address.
 fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!(
@@ -286,14 +286,14 @@ fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'st
     );
     std::thread::spawn(move || {
         for visitor in listener.incoming() {
-            // One that hangs up is none of the camera's business.
+            // The camera ignores clients that hang up.
             let _ = visitor.and_then(&answer);
         }
     });
     url
 }
 
-/// Motion JPEG over HTTP, the way cheap network cameras speak.
+/// Motion JPEG over HTTP, the protocol of cheap network cameras.
 fn motion_jpeg(mut visitor: TcpStream) -> std::io::Result<()> {
     let request = BufReader::new(visitor.try_clone()?);
     let lines: Vec<String> = request
@@ -354,7 +354,7 @@ fn silent_network_camera_times_out() {
     });
     let asked = Instant::now();
     let error = source(&format!("kind = 'url'\nurl = '{url}'")).open(Duration::from_millis(300));
-    let error = error.err().expect("nothing comes").to_string();
+    let error = error.err().expect("no frame arrives").to_string();
     assert!(
         asked.elapsed() < Duration::from_secs(30),
         "it has a limit of its own"
@@ -418,7 +418,7 @@ fn signal(id: u32, signal: Signal) {
     kill(Pid::from_raw(id as i32), signal).unwrap();
 }
 
-/// A process of its own that opens this source, so that its program is told from those of other tests.
+/// A separate process that opens this source, so that its program differs from the programs of other tests.
 struct Opened {
     process: Child,
     program: u32,
@@ -480,7 +480,7 @@ fn killed_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGKILL);
-    until("the node tells of it", || {
+    until("the node reports it", || {
         log(directory.path()).contains("ecod-video ended, signal: 9 (SIGKILL)")
     });
     until("frames come again", || {
@@ -494,7 +494,7 @@ fn hanging_program_is_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGSTOP);
-    until("the node tells of it", || {
+    until("the node reports it", || {
         log(directory.path()).contains("no frame for")
     });
     until("frames come again", || {

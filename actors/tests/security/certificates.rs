@@ -1,4 +1,4 @@
-//! Clients that have no certificate of the cell, or none that is still good.
+//! Clients without a valid certificate of the cell.
 
 use std::fs;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ async fn client_without_certificate_is_refused() {
         .client();
     let stream = TcpStream::connect(cell.address).await.unwrap();
     let name = ServerName::try_from(BROKER_NAME).unwrap();
-    // With TLS 1.3 the client learns of the refusal from what it reads first.
+    // With TLS 1.3 the client receives the refusal with its first read.
     if let Ok(mut stream) = TlsConnector::from(anonymous).connect(name, stream).await {
         stream.write_all(&LOGIN_PACKET).await.ok();
         let read = timeout(SOON, stream.read(&mut [0; 16]))
@@ -117,7 +117,7 @@ async fn only_city_vehicle_connects() {
 }
 
 impl Pki {
-    /// A certificate of this CA for somebody who trusts the cell's.
+    /// A certificate of this CA for a client that trusts the cell's CA.
     fn issue_elsewhere(mut self, name: &str, cell: &Cell) -> (TlsConfig, Self) {
         let files = self.issue(name, Role::Edge, DAY);
         (
@@ -202,7 +202,7 @@ async fn revoked_client_is_disconnected() {
         .unwrap();
 }
 
-/// A vehicle that never leads cannot pose as a broker: its own kind does not trust it.
+/// A vehicle that cannot lead cannot pose as a broker: other nodes reject its certificate.
 #[tokio::test]
 async fn vehicle_certificate_makes_no_broker() {
     let mut cell = Cell::start().await;

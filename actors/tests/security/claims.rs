@@ -1,4 +1,4 @@
-//! Clients with a certificate of the cell that claim to be somebody else.
+//! Clients with a certificate of the cell that claim another identity.
 
 use ecod::wire::Role;
 use ecod_actors::telemetry::counters::Event;
@@ -15,7 +15,7 @@ async fn log_in(cell: &mut Cell, client: &str, role: Role) -> Client {
     gauss
 }
 
-/// Each of these publications must be denied, and counted once; none was denied before.
+/// Each of these publications must be denied, and counted once; the denials are new.
 async fn are_denied(cell: &Cell, client: &mut Client, topics: &[&str], retain: bool) {
     for (denied, topic) in (1..).zip(topics) {
         client
@@ -36,7 +36,8 @@ async fn foreign_topic_is_refused() {
         "nodes/edge",
         "ledger/edge",
     ];
-    // The last three are for the elected alone, which the broker's node knows from authenticated datagrams.
+    // The last three publications are for the elected leader only, which the broker's node determines from
+    // authenticated datagrams.
     let elected = ["global_detections", "global_verdicts", "reputations"];
     are_denied(&cell, &mut gauss, &[&others[..], &elected].concat(), false).await;
     let counts = cell.counters.rejects_by_source();
@@ -44,7 +45,7 @@ async fn foreign_topic_is_refused() {
         .iter()
         .find(|count| count.source == "gauss" && count.reason.as_str() == "not_permitted");
     assert_eq!(by_gauss.map(|count| count.times), Some(7));
-    // The edge sees the next report, and none of the above.
+    // The edge receives the next report, and none of the denied publications.
     cell.honest_traffic_goes_on().await;
 }
 
@@ -52,7 +53,8 @@ async fn foreign_topic_is_refused() {
 async fn one_certificate_is_one_vehicle() {
     let mut cell = Cell::start().await;
     let mut gauss = log_in(&mut cell, "gauss--2", Role::Auto).await;
-    // Its parts may report, and count as the vehicle; they have no evidence, nor are others' parts its own.
+    // Parts of the vehicle may report, and count as the vehicle. They have no evidence, and parts of other vehicles are
+    // not accepted.
     are_denied(
         &cell,
         &mut gauss,

@@ -1,4 +1,4 @@
-//! A standby whose own broker lets others publish in the leader's name: its node trusts a second CA.
+//! A standby whose broker lets others publish in the leader's name, because its node trusts a second CA.
 
 use std::fs;
 use std::time::Duration;
@@ -24,7 +24,7 @@ const ATTACK: Duration = Duration::from_secs(3);
 /// A vehicle that no honest map names.
 const FALSE: &str = "zeno";
 
-/// The map that an honest leader would publish next, if it told of a vehicle that is not there.
+/// The map that an honest leader would publish next, plus an invented vehicle.
 fn false_map(after: &GlobalMap, ahead: u64) -> GlobalMap {
     let fused_at_us = Timestamp(after.fused_at_us.micros() + 100_000 * ahead);
     let correction = PoseCorrection {
@@ -154,7 +154,7 @@ async fn forged_standby_rounds_are_refused() {
         for (node, which) in [(&gauss, "the vehicle"), (&euclid, "the standby")] {
             assert!(
                 !is_deceived(node),
-                "{which} takes what a stranger says in the leader's name"
+                "{which} accepts a stranger's message in the leader's name"
             );
         }
         sleep(Duration::from_millis(20)).await;

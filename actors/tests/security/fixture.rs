@@ -1,4 +1,4 @@
-//! A broker behind a gate, two honest clients, and what an attacker needs.
+//! A broker behind a gate, two honest clients, and the tools of an attacker.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -26,7 +26,7 @@ pub(crate) const DAY: Duration = Duration::from_secs(86_400);
 /// Maximum time for anything on a machine that does much else.
 pub(crate) const SOON: Duration = Duration::from_secs(20);
 
-/// Longest time from a changed revocation list until a node has nothing to do with the revoked one any more.
+/// Maximum time from a changed revocation list until a node has removed all traces of the revoked node.
 pub(crate) const GONE_WITHIN: Duration = Duration::from_secs(2);
 
 /// Largest packet of the broker.
@@ -42,7 +42,7 @@ pub(crate) fn node(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
 }
 
-/// A CA, that of a city above it if there is one, and their directory.
+/// A CA, the CA of its city if there is one, and their directory.
 pub(crate) struct Pki {
     pub(crate) directory: TempDir,
     pub(crate) authority: Authority,
@@ -89,7 +89,7 @@ impl Pki {
         self.files(&self.authority, name)
     }
 
-    /// The files of an edge, a candidate and a vehicle that never leads.
+    /// The files of an edge, a candidate and a vehicle that cannot lead.
     pub(crate) fn issue_three(&mut self) -> [TlsConfig; 3] {
         [
             ("edge", Role::Edge),
@@ -170,12 +170,12 @@ impl Cell {
         Self::start_with(|_| ()).await
     }
 
-    /// The same with other limits.
+    /// The fixture with other limits.
     pub(crate) async fn start_with(adjust: impl FnOnce(&mut BrokerConfig)) -> Self {
         Self::start_in(Pki::new(), adjust).await
     }
 
-    /// The same with certificates of this CA.
+    /// The fixture with certificates of this CA.
     pub(crate) async fn start_in(mut pki: Pki, adjust: impl FnOnce(&mut BrokerConfig)) -> Self {
         let edge = pki.issue("edge", Role::Edge, DAY);
         let euclid = pki.issue("euclid", Role::Cav, DAY);
@@ -217,7 +217,7 @@ impl Cell {
         }
     }
 
-    /// Asserts that a report of the vehicle reaches the edge, and nothing else does.
+    /// Asserts that a report of the vehicle, and only this report, reaches the edge.
     pub(crate) async fn honest_traffic_goes_on(&mut self) {
         self.sent += 1;
         let report = format!("report {}", self.sent);
@@ -228,7 +228,7 @@ impl Cell {
         let received = async {
             tokio::select! {
                 error = &mut flush => panic!("the vehicle lost its broker: {error}"),
-                received = timeout(SOON, self.edge.message()) => received.expect("nothing came").unwrap(),
+                received = timeout(SOON, self.edge.message()) => received.expect("no message arrived").unwrap(),
             }
         };
         assert_eq!(
@@ -283,7 +283,7 @@ impl Client {
         Self { client, events }
     }
 
-    /// Connects, or says why not.
+    /// Connects, or returns the reason of the refusal.
     pub(crate) async fn log_in(&mut self) -> Result<(), String> {
         let polled = timeout(SOON, self.events.poll())
             .await
@@ -314,7 +314,7 @@ impl Client {
         self.publish_all_and_wait(topic, retain, b"forged").await
     }
 
-    /// The same with a payload of one's own.
+    /// Publishes with this payload.
     pub(crate) async fn publish_all_and_wait(
         &mut self,
         topic: &str,

@@ -1,4 +1,4 @@
-//! Clients that knock too often, wait too long, or send what is no MQTT or too much of it.
+//! Clients that connect too often, wait too long, or send too much or malformed MQTT.
 
 use std::collections::VecDeque;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -83,7 +83,7 @@ async fn slow_login_loses_its_place() {
         silent.push(knock(cell.address).await);
     }
     let mut halfway = knock(cell.address).await;
-    // The beginning of a handshake whose rest never comes.
+    // The beginning of a handshake without the rest.
     halfway.write_all(&[22, 3, 1, 2, 0, 1, 0]).await.unwrap();
     let mut slow = secure(&mut cell).await;
     slow.write_all(&[0x10, 60, 0, 4]).await.unwrap();
@@ -199,7 +199,7 @@ async fn certificate_takes_no_foreign_places() {
         .expect("who leaves makes room");
 }
 
-/// The broker of a node that nobody configured: for this machine only, without certificates.
+/// The broker of an unconfigured node: for this machine only, without certificates.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn limits_hold_on_default_loopback() {
     let mut config = NodeConfig {

@@ -1,4 +1,4 @@
-//! Datagrams between nodes, recorded and sent again by somebody on the way.
+//! Datagrams between nodes, recorded and sent again by an attacker on the path.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -26,8 +26,8 @@ fn received_by(node: &Member) -> Vec<u8> {
     payloads.collect()
 }
 
-/// Stands between two nodes and sends every datagram for the first three times; the second knows the first by its
-/// address only.
+/// Relays between two nodes and sends every datagram for the first node three times; the second node has only the
+/// relay's address.
 async fn repeat(towards: SocketAddr, relay: UdpSocket) {
     let behind = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     let mut there = [0; 2048];

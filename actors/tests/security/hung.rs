@@ -23,7 +23,7 @@ async fn hanging_broker_is_declared_dead() {
         credentials: Some(Arc::new(Credentials::load(&files, &node("edge")).unwrap())),
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
-        // Asked on the broker's thread, and does not answer while the test runs.
+        // A check on the broker's thread that does not return while the test runs.
         elected: Arc::new(move |_| held.lock().unwrap().recv().is_ok()),
         counters: Arc::default(),
     };

@@ -38,7 +38,7 @@ fn seen_by(node: &Member) -> Vec<(String, Role)> {
         .collect()
 }
 
-/// All declare to be an edge; what others see is what their certificates allow.
+/// All declare to be an edge; other nodes use the roles that the certificates allow.
 #[tokio::test]
 async fn nodes_meet_only_with_certificates() {
     let mut pki = Pki::new();
@@ -71,7 +71,7 @@ async fn nodes_meet_only_with_certificates() {
     assert_eq!(
         seen_by(&edge),
         [("euclid".to_owned(), Role::Auto)],
-        "as its certificate says"
+        "as in its certificate"
     );
     assert_eq!(seen_by(&euclid), [("edge".to_owned(), Role::Edge)]);
     assert!(seen_by(&bare).is_empty() && seen_by(&strange).is_empty());

@@ -77,7 +77,7 @@ impl Write for Log {
     }
 }
 
-/// Sessions of the membership go on by the former certificate. New connections meet the other one.
+/// Sessions of the membership continue with the former certificate. New connections use the other certificate.
 #[tokio::test]
 async fn followers_skip_distrusted_leader() {
     let mut pki = Pki::new();
@@ -85,7 +85,7 @@ async fn followers_skip_distrusted_leader() {
     let files = pki.issue_three();
     let foreign = elsewhere.issue("edge", Role::Edge, DAY);
     let tls = client_config("gauss", &files[2]);
-    // The edge alone trusts the other CA.
+    // Only the edge trusts the other CA.
     let own = TlsConfig {
         ca: files[0].ca.with_file_name("both.pem"),
         revocation_list: None,
@@ -179,9 +179,12 @@ async fn sole_leader_reports_refused_logins() {
     let edge = full_edge(&mut pki).await;
     let gauss = pki.issue("gauss", Role::Cav, DAY);
     let gauss = start("gauss", Role::Cav, gauss, edge.gossip_address()).await;
-    until("edge knows it", || edge.leadership().borrow().is_deserted).await;
+    until("the edge has the report", || {
+        edge.leadership().borrow().is_deserted
+    })
+    .await;
     gauss.stop().await;
-    until("nobody is left to complain", || {
+    until("no node reports a trouble", || {
         !edge.leadership().borrow().is_deserted
     })
     .await;

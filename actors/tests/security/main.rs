@@ -1,4 +1,4 @@
-//! Attacks on a cell; every one of them asserts that honest traffic goes on.
+//! Attacks on a cell; each test asserts that honest traffic continues.
 
 mod brokers;
 mod certificates;

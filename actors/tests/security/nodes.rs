@@ -19,7 +19,7 @@ pub(crate) async fn start(
     start_with(node, role, tls, seed, |_| ()).await
 }
 
-/// The same with other settings.
+/// The node with other settings.
 pub(crate) async fn start_with(
     node: &str,
     role: Role,

@@ -1,4 +1,4 @@
-//! A broker that others use too, such as the town's: whoever reaches it can publish, only the cell's nodes can sign.
+//! A shared broker, such as a town's: every client of the broker can publish, only the cell's nodes can sign.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -29,7 +29,7 @@ fn config(node: &str, role: Role, broker: SocketAddr, gossip: Option<SocketAddr>
     config
 }
 
-/// Waits for a map that is newer than what is there.
+/// Waits for a map that is newer than the present map.
 async fn takes_a_map(node: &NodeHandle) {
     let mut maps = node.newest_map();
     maps.mark_unchanged();

@@ -115,7 +115,7 @@ async fn revoked_certificate_is_not_renewed() {
         .unwrap();
     let edge = start("edge", Role::Edge, edge_files, None).await;
     let gauss = start("gauss", Role::Cav, files.clone(), edge.gossip_address()).await;
-    until("gauss says why", || ending(&gauss).is_some()).await;
+    until("gauss reports the reason", || ending(&gauss).is_some()).await;
     assert_eq!(
         ending(&gauss).unwrap(),
         "this node's certificate ends in 24 days: edge does not renew it: its certificate was revoked"

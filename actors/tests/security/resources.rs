@@ -1,4 +1,5 @@
-//! Bytes that one certificate sends, holds back or leaves unread: they cost itself only, and honest use costs nothing.
+//! Bytes that one certificate sends, holds back or leaves unread affect only its owner, and honest clients are not
+//! limited.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -61,7 +62,7 @@ async fn greet(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), id: &str, fla
 
 const CLEAN: u8 = 0x02;
 
-/// The fixture's own subscriber of everything, which reads only while it is asked to.
+/// The fixture's subscriber to everything, which reads only on request.
 const IDLE: &str = "edge";
 
 async fn subscribe(
@@ -146,7 +147,7 @@ impl Honest {
         self.vehicle.write_all(&report("v01", 2000)).await.unwrap();
         timeout(SOON, read_messages(&mut self.leader, 1))
             .await
-            .expect("nothing came");
+            .expect("no message arrived");
         begun.elapsed()
     }
 }
@@ -250,7 +251,8 @@ async fn subscriptions_of_certificate_count_together() {
     cell.honest_traffic_goes_on().await;
 }
 
-/// Messages are granted without acknowledgement only, and sessions end with their connections: nothing is kept for later.
+/// Messages are granted without acknowledgement only, and sessions end with their connections, so the broker keeps no
+/// message for later.
 #[tokio::test]
 async fn absent_readers_have_no_queue() {
     let mut cell = Cell::start().await;
@@ -358,7 +360,7 @@ async fn large_maps_reach_all_readers() {
     assert_eq!(cell.counters.all_shed(), []);
 }
 
-/// A broker for its own machine, where nothing tells clients apart.
+/// A broker for its own machine, which cannot distinguish clients.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn uncertified_slow_readers_lose_theirs() {
     let counters = Arc::<Counters>::default();
@@ -402,7 +404,7 @@ async fn uncertified_slow_readers_lose_theirs() {
         vehicle.write_all(&report("v01", 2000)).await.unwrap();
         timeout(SOON, read_messages(&mut leader, 1))
             .await
-            .expect("nothing came");
+            .expect("no message arrived");
         sleep(Duration::from_millis(20)).await;
     }
     flood.abort();

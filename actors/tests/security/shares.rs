@@ -6,7 +6,7 @@ use ecod::wire::{LedgerEntry, LedgerShare, SCHEMA_VERSION};
 /// Plausible number of votes of one vehicle: only the way of the evidence gives it away.
 const VOTES: u64 = 50_000;
 
-/// Counts by which the liar is always right and the honest vehicle never, as a node shares them.
+/// A node's share in which the malicious vehicle is always right and the honest vehicle always wrong.
 pub(crate) fn inverted(sender: &str, epoch: u64, aggregator: &str) -> LedgerShare {
     let name = |name: &str| NodeName::new(name).unwrap();
     let entry = |node: &str, correct, incorrect| {

@@ -1,4 +1,4 @@
-//! A leader whose certificate is revoked while it leads, and which does not know it: its own list stays as it was.
+//! A leader whose certificate is revoked while it leads, without its knowledge: its own list remains unchanged.
 
 use std::time::Duration;
 
@@ -66,7 +66,7 @@ async fn revoked_leader_is_replaced() {
             assert_eq!(
                 aggregator(node).as_deref(),
                 Some("euclid"),
-                "the revoked leader is heard again"
+                "a message of the revoked leader was accepted again"
             );
         }
         sleep(Duration::from_millis(5)).await;

@@ -34,7 +34,7 @@ fn login(will: Option<&str>) -> Vec<u8> {
     )
 }
 
-/// Sends a packet and asserts what is answered.
+/// Sends a packet and asserts the answer.
 async fn ask(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), packet: &[u8], expected: &[u8]) {
     stream.write_all(packet).await.unwrap();
     let mut answer = vec![0; expected.len()];
@@ -127,7 +127,7 @@ async fn packet_with_many_filters_refused() {
     cell.honest_traffic_goes_on().await;
 }
 
-/// The broker without a guard has no one to ask, and must survive all the same.
+/// The broker without a guard has no access check, and must survive all the same.
 #[tokio::test]
 async fn unguarded_broker_survives_endless_topics() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());

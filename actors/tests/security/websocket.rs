@@ -1,4 +1,4 @@
-//! WebSockets behind TLS: certificates and limits are those of other clients.
+//! WebSockets behind TLS: certificates and limits are equal to those for other clients.
 
 use std::time::{Duration, Instant};
 
@@ -15,7 +15,8 @@ use tokio_tungstenite::{WebSocketStream, client_async};
 
 use crate::fixture::{Cell, MAX_EACH, SOON, secure};
 
-/// A WebSocket with a certificate that asks to log in with this client id; gives the answer, nothing when it is cut off.
+/// A WebSocket with a certificate that requests a login with this client id; returns the answer, or no answer if the
+/// connection is cut.
 async fn log_in(cell: &mut Cell, id: &str) -> (WebSocketStream<TlsStream<TcpStream>>, Vec<u8>) {
     let mut request = "wss://broker.ecod.internal/".into_client_request().unwrap();
     request
@@ -61,7 +62,7 @@ async fn websocket_has_rights_of_certificate() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn empty_frames_count_their_size() {
-    // First the burst is used up, and what the sockets hold.
+    // First the burst is used up, and the buffers of the sockets.
     const BEGIN: Duration = Duration::from_secs(5);
     const END: Duration = Duration::from_secs(9);
     let mut cell = Cell::start_with(|config| config.max_clients_each = 32).await;

@@ -6,12 +6,12 @@
 //!    └────── reads ──>  map logs, memory of the edge ──> the row's line in the table
 //! ```
 //!
-//! Each node has a network namespace, joined by a bridge, and attackers an address of their own there. Where namespaces
-//! cannot be made, all are on loopback, and the harness says so.
+//! Each node has a network namespace, joined by a bridge, and attackers have a separate address there. Without the
+//! right to create namespaces, all are on loopback, and the harness prints this.
 //!
-//! Each kind of attacker has a file with its rows. Those on brokers run against the leader's, then against the standby's. `ROWS=a,b` runs those whose names contain `a` or `b`;
-//! `ATTACK=quick` runs only those for every change, `PROGRAM=file` attacks another build. A row that missed its bar
-//! while the machine stood still is repeated.
+//! Each kind of attacker has a file with its rows. Attacks on brokers run against the leader's broker, then against the
+//! standby's. `ROWS=a,b` runs the rows whose names contain `a` or `b`; `ATTACK=quick` runs only the rows for every
+//! change, `PROGRAM=file` attacks another build. A row that missed its bar while the machine stalled is repeated.
 
 mod candidate;
 mod cell;
@@ -115,7 +115,7 @@ async fn run_all() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Runs a row until it meets its bar, or misses it on a machine that runs.
+/// Runs a row until it meets its bar, or misses it without a stall of the machine.
 async fn attempt(row: &Row, victim: Victim, time: Duration) -> anyhow::Result<Outcome> {
     for left in (0..MAX_ATTEMPTS).rev() {
         let mut machine = Machine::default();
@@ -154,7 +154,7 @@ async fn run(
     })
 }
 
-/// An attack under way, on threads of its own.
+/// An attack under way, on separate threads.
 struct Attacker {
     runtime: Runtime,
     task: tokio::task::JoinHandle<anyhow::Result<()>>,

@@ -155,7 +155,7 @@ static TRIALS_WITH_CERTIFICATES: [Trial; 3] = [
     },
 ];
 
-/// The edge starts last: whatever its clock says, it takes over from a working leader.
+/// The edge starts last: with any clock, it takes over from a working leader.
 fn run(trial: &Trial) -> Outcome {
     let has_certificates = TRIALS_WITH_CERTIFICATES
         .iter()
@@ -256,7 +256,7 @@ struct Outcome {
     /// Longest time without each.
     losses: Vec<(&'static str, Duration)>,
     readiness: String,
-    /// Longest time for which the node with that clock said that it is ready while it was of no use.
+    /// Longest time for which the node with that clock reported that it is ready without being useful.
     idle: Duration,
     /// Largest difference between a map's date and the true time.
     dated: Duration,
@@ -328,8 +328,8 @@ fn nodes_with_wrong_clocks_participate() {
     }
 }
 
-/// Nobody believes its certificate, nor does it believe others': it says so and waits, and takes part as soon as its clock
-/// is set.
+/// The node and the others reject each other's certificates. The node reports this and waits, and becomes a member as
+/// soon as its clock is set.
 #[test]
 fn certified_node_waits_for_clock() {
     for late in ["noether", "edge"] {
@@ -360,7 +360,7 @@ fn certified_node_waits_for_clock() {
             "edge" => record.source() == Some("edge"),
             vehicle => record.has_lately([vehicle]),
         };
-        cell.until("it takes part", takes_part);
+        cell.until("the node is a member", takes_part);
         let took = cell.first_ready(late, set_at).since(set_at);
         println!("{late}, with a certificate, was ready {took:?} after its clock was set");
         let end = cell.now() + OWN_LOSS;

@@ -1,11 +1,11 @@
 //! Failover as vehicles see it: cells of real processes, killed, stopped, cut off and starved, again and again.
 //!
-//! Here are two harnesses. `make soak` runs the one in `soak`. `make trials` runs the other; `TRIALS=n` is the number
-//! of trials of each scenario and cell size (default 20), `SCENARIOS=a,b` and `NODES=2,5` run those only. What cannot
-//! be run on this machine is skipped and said to be. A trial that missed a bar while the machine stood still is void, and
-//! repeated, at most as many times as there are to be trials; superseded maps and lost reputations count all the same,
-//! and a scenario of which no trial counts has failed. The results are printed and written to `target/trials.json`; the
-//! files of a trial that went wrong are kept.
+//! This module has two harnesses. `make soak` runs the harness in `soak`. `make trials` runs the other one; `TRIALS=n`
+//! is the number of trials of each scenario and cell size (default 20), `SCENARIOS=a,b` and `NODES=2,5` select
+//! scenarios and sizes. Scenarios that cannot run on this machine are skipped and listed. A trial that missed a bar
+//! while the machine stalled is void and repeated, at most as many times as the number of trials; superseded maps and
+//! lost reputations always count, and a scenario without a valid trial has failed. The results are printed and written
+//! to `target/trials.json`; the files of a failed trial are kept.
 
 mod analysis;
 mod cell;
@@ -44,7 +44,7 @@ fn trials() {
     end_with_the_harness(run_all());
 }
 
-/// Runs to the end, or until the harness is told to end.
+/// Runs to the end, or until the harness is stopped.
 #[track_caller]
 fn end_with_the_harness(work: impl Future<Output = anyhow::Result<()>>) {
     // Processes end with the thread that started them: all are started by this one.
@@ -157,7 +157,7 @@ async fn run(
                 }],
             )
             .misses();
-            // A trial that meets its bars in spite of it counts.
+            // A trial that meets its bars in spite of a stall counts.
             let verdict = Verdict {
                 is_void: verdict.is_void && !misses.is_empty(),
                 ..verdict
@@ -233,7 +233,7 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
         println!("the machine stood still: {}", machine.account());
     }
     let flood = cell.flood_cost()?;
-    // Doors first: a node has written what its door has sent.
+    // Doors first, because a node has written all messages that its door has sent.
     let doors = cell.doors()?;
     let runs = cell.runs()?;
     let doors = judge_doors(&runs, &doors, &phases, cell.flooded());

@@ -1,4 +1,4 @@
-//! A cell from nothing, as its owner makes it: one machine makes it, the others join by tokens.
+//! A new cell as its owner sets it up: one machine creates the cell, the others join by tokens.
 
 mod machines;
 
@@ -244,7 +244,7 @@ fn city_cell_accepts_city_vehicles() {
         at(gauss, "cell.key")
     );
     fs::write(euclid.path().join("node.toml"), configuration).unwrap();
-    // The node that joined leads alone: the vehicle takes its maps if both trust the other.
+    // The node that joined leads alone: the vehicle accepts its maps if both trust each other.
     let _nodes = [
         run(Path::new(gauss), &gossip),
         run(euclid.path(), "127.0.0.1:0"),
@@ -286,7 +286,7 @@ fn init_and_invite_explain_refusal() {
     );
 }
 
-/// A node's certificate that has ended, in place of the one that it has.
+/// An expired certificate of a node, in place of its present certificate.
 fn let_end(pki: &Path, node: &str, role: Role, machine: &Path) {
     let name = NodeName::new(node).unwrap();
     let day = Duration::from_secs(86_400);

@@ -1,9 +1,8 @@
-//! Processor time that a hypervisor withholds: what a cell misses for want of it tells nothing of the cell.
+//! Processor time that a hypervisor withholds: failures of a cell in this time are not failures of the cell.
 //!
-//! Where the host of a virtual machine is busy, processes that could run stand still, all at once and for longer than a
-//! leader may be silent. Linux counts that time (steal, proc_stat(5)) where it is told of it: time in which something
-//! could have run. Where it is not, whoever does nothing but sleep wakes too late; other busy processes of the same
-//! machine delay a sleeper by milliseconds.
+//! If the host of a virtual machine is busy, runnable processes stall, all at once and for longer than a leader may be
+//! silent. Linux counts this time as steal (proc_stat(5)) if the host reports it. Otherwise a thread that only sleeps
+//! wakes too late; other busy processes of the machine delay a sleeper only by milliseconds.
 
 use std::fs;
 use std::num::NonZero;
@@ -28,7 +27,7 @@ const LONGEST_DELAY: Duration = Duration::from_millis(100);
 /// Ticks of /proc/stat per second, on all common architectures.
 const TICKS_PER_S: u64 = 100;
 
-/// Waits, and notes meanwhile what the machine does not get.
+/// Waits, and records meanwhile the processor time that is withheld from the machine.
 #[derive(Debug, Default)]
 pub(crate) struct Machine {
     /// When, and time withheld from all processors since the machine was started.
@@ -53,7 +52,7 @@ impl Machine {
         }
     }
 
-    /// True if what comes late may be late for want of processor time.
+    /// True if an event may be late because of withheld processor time.
     pub(crate) fn is_starved(&self) -> bool {
         self.most_withheld() > MOST_WITHHELD || self.longest_delay > LONGEST_DELAY
     }

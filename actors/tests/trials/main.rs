@@ -1,4 +1,5 @@
-//! Harnesses that run cells of real processes: under faults, under attack, with wrong clocks, and from nothing.
+//! Harnesses that run cells of real processes: under faults, under attack, with wrong clocks, and from empty
+//! directories.
 //!
 //! A harness takes minutes. A target of make runs it alone, by its exact name; `make test` runs what takes seconds.
 

@@ -1,4 +1,4 @@
-//! Where the nodes of a trial meet: loopback, or a network namespace for each, joined by bridges.
+//! The network of a trial's nodes: loopback, or a network namespace for each node, joined by bridges.
 //!
 //! ```text
 //! node 0: eth0 ── veth ──┐            one bridge, or two while the network is split
@@ -87,7 +87,7 @@ impl Bridged {
         Ok(network)
     }
 
-    /// Joins some nodes among themselves only, or, with none, all.
+    /// Joins some nodes among themselves only, or all nodes without an argument.
     pub(crate) fn split(&self, apart: &[usize]) -> anyhow::Result<()> {
         for node in 0..self.nodes {
             let side = if apart.contains(&node) { 'b' } else { 'a' };
@@ -108,7 +108,7 @@ impl Bridged {
         ip(&arguments)
     }
 
-    /// Every node loses so many percent of what arrives; none for zero.
+    /// Every node loses this percentage of arriving packets; zero removes the loss.
     pub(crate) fn lose(&self, percent: u8) -> anyhow::Result<()> {
         let rules = if percent == 0 {
             "delete table inet trials\n".to_owned()
@@ -124,7 +124,7 @@ impl Bridged {
 
 impl Drop for Bridged {
     fn drop(&mut self) {
-        // One that was never made is not there to be removed.
+        // A namespace that was not created does not exist for removal.
         for node in 0..self.nodes {
             // With its namespace alone it would go a while later, when the next trial makes its own.
             let _ = ip(&["link", "delete", &port(node)]);
@@ -136,7 +136,7 @@ impl Drop for Bridged {
     }
 }
 
-/// Name of a node's namespace; one harness does not meet another.
+/// Name of a node's namespace, which is separate for each harness.
 pub(crate) fn namespace(node: usize) -> String {
     format!("ecod-{}-{}", std::process::id(), node as u16)
 }

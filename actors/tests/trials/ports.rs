@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, TcpListener, UdpSocket};
 use anyhow::bail;
 use ecod_actors::platform::clock;
 
-/// Hands out ports that are free now, from below those that the system gives to outgoing connections.
+/// Returns free ports below the range that the system uses for outgoing connections.
 pub(crate) struct Ports {
     next: u16,
 }

@@ -53,7 +53,7 @@ impl Process {
         Ok(())
     }
 
-    /// SIGSTOP: the process does nothing, its connections stay open.
+    /// SIGSTOP: the process stalls, and its connections stay open.
     pub(crate) fn pause(&self) -> anyhow::Result<()> {
         self.signal(Signal::SIGSTOP)
     }

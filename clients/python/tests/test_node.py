@@ -98,7 +98,7 @@ def test_a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell(
         place = agreed(cell, "edge").landmarks[0]
         latitude, longitude, height = origin.to_wgs84(place.x_m, place.y_m)
         assert (latitude, longitude) == pytest.approx((52.2296774, 21.0122302), abs=2e-7) and height == pytest.approx(113.0, abs=1e-3)
-        # A vehicle without a node asks at the leader's broker.
+        # A vehicle without a node sends its request to the leader's broker.
         with ecod.Cell(node.address, cell_name, node="euclid") as elsewhere:
             assert elsewhere.origin() == origin
         describe("[fusion.pace]\ngate_m = 0.5\n")

@@ -325,8 +325,8 @@ impl Cell {
     ///
     /// # Errors
     /// Returns [`Error::Invalid`] for values that the protocol does not allow, such as a box outside
-    /// the image, and [`Error::Refused`] if the broker refused the login or earlier boxes, or is no
-    /// broker of a node and answers that nobody receives them.
+    /// the image, and [`Error::Refused`] if the broker refused the login or earlier boxes, or does
+    /// not belong to a node and answers that there is no receiver.
     pub fn report_boxes(&self, image: BoxFrame) -> Result<bool, Error> {
         let BoxFrame {
             captured_at,

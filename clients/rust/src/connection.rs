@@ -339,7 +339,7 @@ impl State {
         self.queued.push_back(topic.to_owned());
     }
 
-    /// True if a packet asked whether the broker takes boxes.
+    /// True if a packet checks whether the broker accepts boxes.
     fn asks_boxes(&self, packet: u16) -> bool {
         self.unanswered
             .get(&packet)

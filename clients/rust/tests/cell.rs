@@ -1,6 +1,9 @@
 //! A program in cells of real nodes, and at a real broker that sends arbitrary messages.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test that cannot continue panics at that line"
+)]
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;

@@ -7,11 +7,11 @@ use rumqttc::{
     TlsConfiguration, Transport,
 };
 
-/// A broker, and the access data that it and its cell require from clients: TLS, user name and
-/// password, signed payloads.
+/// Address of a broker with the credentials that it and its cell require from clients: TLS, user
+/// name and password, signed payloads.
 #[derive(Debug, Clone)]
 pub struct BrokerAccess {
-    /// Where it is.
+    /// Address of the broker.
     pub broker: BrokerAddress,
     login: Option<(String, String)>,
     pub(super) security: Security,
@@ -45,8 +45,8 @@ impl BrokerAccess {
     /// Access as a node with this configuration; the files that it names are read.
     ///
     /// # Errors
-    /// Returns an [`AccessError`] if the broker is one of the cell's own with certificates, or a
-    /// file cannot be used.
+    /// Returns an [`AccessError`] if the broker is embedded in a node with certificates, or a file
+    /// cannot be used.
     pub fn of(broker: BrokerAddress, config: &NodeConfig) -> Result<Self, AccessError> {
         if config.tls.is_some() && config.mqtt.broker.as_ref() != Some(&broker) {
             return Err(AccessError::Closed(broker));

@@ -219,9 +219,7 @@ impl BenchArguments {
         };
         let config = config.unwrap_or_default();
         if !config.fusion.algorithms.pace() {
-            bail!(
-                "the configuration has `fusion.algorithms` vote: without maps it shows nowhere which reports a round rests on"
-            );
+            bail!("the benchmark needs maps: set `fusion.algorithms` to `pace` or `both`");
         }
         let access = BrokerAccess::of(broker, &config)?;
         // By packets, not every round has verdicts.

@@ -1,6 +1,6 @@
 //! Label sets: answers of many voters about many items, judged by VOTE and by the majority.
 //!
-//! Each item is a landmark and each voter a vehicle. Votes never go stale, and a voter's last answer
+//! Each item is a landmark and each voter a vehicle. Votes do not become stale, and a voter's last answer
 //! about an item replaces earlier ones.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};

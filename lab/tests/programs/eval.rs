@@ -357,7 +357,7 @@ fn sequences_match_names_and_truth() {
         ),
         (
             ["--vehicle", &left, "--vehicle", &right, "--output", &over],
-            "a.txt is to be both read and written",
+            "a.txt is both input and output; choose another output file",
         ),
     ] {
         let run = ecod_lab(&[&["convert", "--format", "mot"][..], &flags].concat());

@@ -66,7 +66,7 @@ pub(super) fn metrics(
             .get_or_create(&vec![("state", state.as_str().to_owned())])
             .set(count(number));
     }
-    let help = "Cells by state; live and silent are told apart where maps are read, the others lead or are offline by their own word";
+    let help = "Cells by state; live and silent apply to cells whose maps are read; for other cells leads and offline follow the leader's status";
     registry.register("cells", help, states);
     gauge(
         &mut registry,

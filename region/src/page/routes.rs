@@ -34,9 +34,9 @@ pub(super) struct RegionApi {
 struct ViewAnswer {
     /// True while the reader is logged in at the broker.
     broker_up: bool,
-    /// The reason why it is not logged in, or the filters that the broker refuses.
+    /// Why the reader is not logged in, or the filters that the broker refuses.
     trouble: Option<String>,
-    /// The reason why the maps of the view are not read.
+    /// Why the region does not subscribe to the maps in this view.
     maps_withheld: Option<String>,
     #[serde(flatten)]
     town: TownView,

@@ -1,15 +1,15 @@
-//! Objects that one vehicle alone states, where others look and see nothing, and where nobody else looks.
+//! Objects that only one vehicle reports, in places that other vehicles observe as empty or do not observe.
 
 use super::*;
 
-/// What an honest vehicle reports beside the objects that all see.
+/// Objects that an honest vehicle reports in addition to the common objects.
 type Seen = fn(frame: u64, vehicle: usize) -> bool;
 
-/// A scene: honest vehicles that see four cars on both sides of a place, and one that states a car at the place.
+/// A scene: honest vehicles detect four cars on both sides of a place, and one vehicle reports a car at the place.
 struct Scene {
     honest: usize,
     is_view_stated: bool,
-    /// True if other cars, behind the place, show that the vehicles look there.
+    /// True if other cars, behind the place, show that the vehicles observe it.
     is_behind: bool,
     /// Distance of all honest vehicles but the first, metres.
     apart_m: f64,
@@ -31,7 +31,7 @@ impl Scene {
         }
     }
 
-    /// Share of the maps of 20 s in which a car at the place is more probable than not, and the correct and incorrect
+    /// Share of the maps of 20 s in which a car at the place has a probability above 0.5, and the correct and incorrect
     /// statements of each vehicle.
     fn published(&self) -> (f64, BTreeMap<NodeName, (u32, u32)>) {
         let mut tracker = tracker();
@@ -94,10 +94,10 @@ fn sole_claim_is_denied() {
             println!("{honest} look, view stated {is_view_stated}: {published:.3}, {counts:?}");
             assert!(
                 published < bound,
-                "{published} beside {honest}, view stated {is_view_stated}"
+                "{published} with {honest} honest vehicles, view stated {is_view_stated}"
             );
             let (right, wrong) = counts[&name("claimant")];
-            // The looks of two alone hardly suffice for a judgement.
+            // Observations of two vehicles are rarely enough for a judgement.
             let least = if honest == 2 { 1 } else { 5 };
             assert!(right == 0 && wrong >= least, "{right} right, {wrong} wrong");
             let honest_ones = counts.iter().filter(|(node, _)| **node != name("claimant"));

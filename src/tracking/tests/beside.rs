@@ -1,4 +1,4 @@
-//! Objects beside, behind and in front of each other.
+//! Objects next to, behind and in front of each other.
 
 use super::*;
 
@@ -64,7 +64,7 @@ fn person_at_vehicle_stays_separate() {
     }
 }
 
-/// Beside a parked car that others see, a vehicle appears whose own body nobody has seen yet.
+/// Next to a parked car that others detect, a vehicle appears whose own body has not been detected yet.
 #[test]
 fn arriving_vehicle_absorbs_no_person() {
     let mut tracker = tracker();
@@ -92,7 +92,7 @@ fn arriving_vehicle_absorbs_no_person() {
     assert_eq!(of_person.len(), 1);
 }
 
-/// Behind a row of trucks that `hidden` sees, others see people.
+/// Behind a row of trucks that `hidden` detects, the other vehicles detect people.
 #[test]
 fn occluded_objects_count_no_misses() {
     let mut tracker = tracker();

@@ -1,11 +1,11 @@
-//! People close together, seen by several cameras that miss some and report some that are not there.
+//! People close together, observed by several cameras with misses and false detections.
 
 use super::*;
 
 /// Number of people in the square.
 const PEOPLE: usize = 12;
 
-/// Where a person is: each goes to and fro on a line of its own, a metre from the next, at 1 m/s.
+/// Position of a person: each person walks back and forth on a separate line, a metre from the next, at 1 m/s.
 fn place(person: usize, t_s: f64) -> Vector2<f64> {
     let phase = (t_s + 2.7 * person as f64).rem_euclid(20.0);
     let along_m = if phase < 10.0 { phase } else { 20.0 - phase };
@@ -16,7 +16,7 @@ fn place(person: usize, t_s: f64) -> Vector2<f64> {
 struct Crowd {
     /// Objects with a confidence of at least 0.5, on average per round.
     published: f64,
-    /// Times that the object nearest to a person was another one than in the round before.
+    /// Number of times that the object nearest to a person differed from the object in the round before.
     switches: usize,
 }
 
@@ -115,7 +115,7 @@ fn misses_and_ghosts_cost_little() {
     assert!(switches <= 8, "{switches} switches");
 }
 
-/// A person goes behind a wall for five seconds.
+/// A person walks behind a wall for five seconds.
 #[test]
 fn person_out_of_sight_keeps_identity() {
     let mut tracker = tracker();
@@ -137,7 +137,11 @@ fn person_out_of_sight_keeps_identity() {
         sure(round).iter().find(walking).map(|object| object.id)
     };
     let before = id(&seen(0..50, true));
-    assert_eq!(id(&seen(50..100, false)), None, "nobody is published there");
+    assert_eq!(
+        id(&seen(50..100, false)),
+        None,
+        "the hidden person is not published"
+    );
     let after = id(&seen(100..120, true));
     assert!(before.is_some() && before == after, "{before:?} {after:?}");
 }

@@ -1,9 +1,9 @@
-//! Roads on which everything is fast, and frames that move.
+//! Fast roads, and moving frames.
 
 use super::*;
 
-/// Two vehicles with a pose each, one behind the other at 27 m/s, between cars that go with them and cars that come
-/// the other way; the second one's clock is 30 ms ahead. Returns by how much cars are off in the last round, on average.
+/// Two vehicles with a pose each, one behind the other at 27 m/s, between cars in the same direction and oncoming cars.
+/// The clock of the second vehicle is 30 ms ahead. Returns the mean error of the cars in the last round.
 fn highway(stamped_late_us: u64) -> Vector2<f64> {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let mut tracker = tracker();
@@ -133,12 +133,12 @@ fn distant_glimpse_widens_no_view() {
     coverage.observe(&stated);
     assert!(
         coverage.range_m() < 30.0,
-        "a view without a pose says nothing of where it is"
+        "a view without a pose has no position"
     );
 }
 
-/// Mean error of the map in the frame of a vehicle that goes at 8 m/s and turns, among parked cars 20 m apart and others
-/// that drive; another vehicle reports in the same frame.
+/// Mean error of the map in the frame of a vehicle that drives at 8 m/s and turns, among parked cars 20 m apart and
+/// moving cars; another vehicle reports in the same frame.
 fn error_in_a_frame_that_turns(yaw_rate_radps: f64) -> f64 {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let mut tracker = tracker();
@@ -212,7 +212,7 @@ fn frequent_reporter_rotates_no_frame() {
             ("liar", Some(2.1)),
             ("liar", Some(2.2)),
         ];
-        // The others report at a third of the rate.
+        // The other vehicles report at a third of the rate.
         for (node, frame_yaw_rate_radps) in
             reports.into_iter().skip(if frame % 3 == 0 { 0 } else { 2 })
         {

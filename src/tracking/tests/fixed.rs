@@ -1,8 +1,8 @@
-//! Cameras that stand, and what all observers have in common.
+//! Fixed cameras, and the common error of all observers.
 
 use super::*;
 
-/// A camera: its place, and the offset and rotation by which it is wrong.
+/// A camera: its position, and the error of its position and rotation.
 struct Camera {
     node: String,
     place: Vector2<f64>,
@@ -12,7 +12,7 @@ struct Camera {
 }
 
 impl Camera {
-    /// Cameras around a square, each wrong by some decimetres.
+    /// Cameras around a square, each with an error of some decimetres.
     fn around(count: usize, is_posed: bool, rng: &mut ChaCha8Rng) -> Vec<Self> {
         let camera = |n: usize| {
             let (sin, cos) = (n as f64 * std::f64::consts::TAU / count as f64 + 0.6).sin_cos();
@@ -29,7 +29,7 @@ impl Camera {
         (0..count).map(camera).collect()
     }
 
-    /// A report of the people that are found, nine in ten.
+    /// A report of the detected people, nine in ten.
     fn report(&self, frame: u64, people: &[Vector2<f64>], rng: &mut ChaCha8Rng) -> ObjectReport {
         let turned = nalgebra::Rotation2::new(self.turned_rad);
         let mut objects = Vec::new();
@@ -49,7 +49,7 @@ impl Camera {
     }
 }
 
-/// Eight people who go around in the square, at a tenth of a second a frame.
+/// Eight people who walk around in the square; frames are a tenth of a second apart.
 fn people(frame: u64) -> Vec<Vector2<f64>> {
     let person = |n: u64| {
         let angle = (n as f64) * 0.8 + frame as f64 * 0.1 * 0.2;
@@ -59,7 +59,7 @@ fn people(frame: u64) -> Vec<Vector2<f64>> {
     (0..8).map(person).collect()
 }
 
-/// Means of the offsets, rotations and delays by which all cameras are corrected.
+/// Means of the corrections of all cameras: offsets, rotations and delays.
 #[derive(Debug, Default)]
 struct Common {
     offset: Vector2<f64>,
@@ -108,8 +108,8 @@ fn common_and_rest(
     )
 }
 
-/// An hour at two frames a second. A radian of rotation in common moves what is 15 m away by 15 m, a second of delay the
-/// fastest by 2 m.
+/// An hour at two frames a second. A common rotation of a radian moves objects at 15 m by 15 m, and a common delay of a
+/// second moves the fastest objects by 2 m.
 #[test]
 fn fixed_cameras_hold_map() {
     for (seed, count, is_posed) in [(1, 2, true), (2, 2, false), (3, 3, true)] {
@@ -158,8 +158,8 @@ fn fixed_cameras_hold_map() {
     }
 }
 
-/// Cameras that state that they do not move, without poses or with estimates of them, keep their corrections while nothing
-/// passes.
+/// Cameras that state that they do not move, with estimated poses or without poses, keep their corrections without
+/// passing objects.
 #[test]
 fn standing_camera_stays_aligned() {
     for is_posed in [false, true] {
@@ -209,7 +209,7 @@ fn standing_camera_stays_aligned() {
     }
 }
 
-/// A camera whose pose is right and a vehicle that is wrong by 0.4 m, for five minutes.
+/// A camera with a correct pose and a vehicle with a pose error of 0.4 m, for five minutes.
 #[test]
 fn camera_ignores_vehicle_error() {
     for camera_every in [1, 2] {
@@ -229,7 +229,7 @@ fn camera_ignores_vehicle_error() {
                 );
             }
             let mut report = observers[1].report(frame, &people(frame), &mut rng);
-            // Estimates of a pose differ while the vehicle waits.
+            // Estimates of a pose vary while the vehicle waits.
             report
                 .pose
                 .iter_mut()
@@ -251,7 +251,7 @@ fn camera_ignores_vehicle_error() {
     }
 }
 
-/// Mean offset of the objects of a map from the people that are nearest.
+/// Mean offset of the objects of a map from the nearest people.
 fn off(round: &TracksRound, people: &[Vector2<f64>]) -> Vector2<f64> {
     let cars = sure(round)
         .into_iter()
@@ -268,7 +268,7 @@ fn off(round: &TracksRound, people: &[Vector2<f64>]) -> Vector2<f64> {
     offsets.iter().sum::<Vector2<f64>>() / offsets.len().max(1) as f64
 }
 
-/// The third of three cameras is wrong by 0.9 m more than the others.
+/// The error of the third of three cameras is 0.9 m larger.
 #[test]
 fn map_stays_when_camera_leaves() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
@@ -296,7 +296,7 @@ fn map_stays_when_camera_leaves() {
     );
 }
 
-/// Two cameras stand for an hour; the third, wrong by 0.9 m more, joins then.
+/// Two cameras stand for an hour; then a third camera joins, whose error is 0.9 m larger.
 #[test]
 fn late_camera_is_aligned_to_others() {
     for is_posed in [true, false] {

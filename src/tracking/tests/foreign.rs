@@ -1,4 +1,4 @@
-//! Objects of neighbouring cells: hand-over of identities, and cells that lie.
+//! Objects of neighbouring cells: hand-over of identities, and cells with false reports.
 
 use std::collections::BTreeMap;
 
@@ -32,7 +32,7 @@ fn foreign_car(number: u128, x_m: f64, y_m: f64, velocity_mps: [f64; 2]) -> Fuse
     }
 }
 
-/// A report with a view all around from the middle of the scene.
+/// A report with a view in all directions from the middle of the scene.
 fn watching(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectReport {
     let pose = crate::model::geometry::Pose::new(0.0, -8.0, 0.0).into();
     let view = FieldOfView {
@@ -52,7 +52,8 @@ fn foreign_object_keeps_identity_and_velocity() {
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();
     for frame in 0..30 {
-        // It goes east at 10 m/s; this cell's vehicle sees it from 1 s on, the neighbour until 1.5 s. Maps take 100 ms.
+        // The car drives east at 10 m/s. This cell's vehicle detects it from 1 s on, the neighbour until 1.5 s. Maps
+        // take 100 ms.
         let x_m = frame as f64 - 20.0;
         if frame % 5 == 0 && frame <= 15 {
             let car = stated("west", 0.1, foreign_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
@@ -106,8 +107,8 @@ fn foreign_object_keeps_identity_and_velocity() {
     );
 }
 
-/// Two cells that see the same eight cars; `later` frames after the first, the second begins. Maps go both ways twice a
-/// second. Returns the identities of both at the end and at their beginnings, by place.
+/// Two cells that detect eight common cars; the second cell begins `later` frames after the first. The cells exchange
+/// maps twice a second. Returns the identities of both cells at the end and at their beginnings, by position.
 fn two_cells(later: u64) -> [Vec<Uuid>; 2] {
     let mut cells = [tracker(), tracker()];
     let mut maps: [Vec<FusedObject>; 2] = Default::default();
@@ -195,8 +196,8 @@ fn smaller_identity_wins_at_equal_age() {
     assert_eq!(ends[8..], smaller);
 }
 
-/// Four cars that drive and two that stand, seen by three vehicles; the neighbour states what `lie` gives in each of its
-/// maps. Returns the sure objects of each round without the identities.
+/// Four moving and two standing cars, detected by three vehicles. In each of its maps the neighbour states the objects
+/// that `lie` returns. Returns the positions of the certain objects of each round.
 fn lied_to(
     tracker: &mut Tracker,
     mut lie: impl FnMut(u64, &[FusedObject]) -> Vec<NeighbourObject>,
@@ -244,7 +245,7 @@ fn unconfirmed_cell_loses_trust() {
     lied_to(&mut tracker, |_, _| (0..8).map(ghost).collect());
     assert_eq!(tracker.trust_in_cell(&name("liar")), 0.0);
     assert!(tracker.hides(&ghost(1)));
-    // Nothing of it is handed over: a car that comes to where a ghost is has an identity of this cell.
+    // The ghost is not handed over: a car that comes to its position has an identity of this cell.
     for frame in 120..125 {
         tracker.take_neighbours(&[ghost(1)], at(frame));
         tracker.observe(
@@ -283,7 +284,8 @@ fn identity_changes_do_not_evade_judgement() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
 
-    /// Ghosts beside and upon this cell's objects, with any velocity, age and precision, and with their identities.
+    /// Ghosts near this cell's objects or at their positions, with any velocity, age and precision, and with the
+    /// identities of the objects.
     #[test]
     fn false_cell_harms_no_object(seed in prop_oneof![1 => Just(4_861_703_545_525_720_796), 5 => any::<u64>()]) {
         let honest = lied_to(&mut tracker(), |_, _| Vec::new());

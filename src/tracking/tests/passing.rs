@@ -1,10 +1,10 @@
-//! Vehicles that pass objects, and those whose word is worth little.
+//! Vehicles that pass objects, and vehicles with low trust.
 
 use super::*;
 use crate::tracking::trust::TrustCounts;
 
-/// `euclid` sees a car all the time. Twenty others are elsewhere, apart from half a second each, one after the other, if
-/// they pass it. Returns the probability that the car exists 20 s after the last of these times.
+/// `euclid` detects a car all the time. Twenty other vehicles are elsewhere. If they pass the car, each observes it for
+/// half a second, one after the other. Returns the probability that the car exists 20 s after the last of these times.
 fn existence_of_a_car(is_passed: bool) -> f64 {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
@@ -38,11 +38,11 @@ fn passing_vehicle_counts_no_misses() {
     let [passed, alone] = [true, false].map(existence_of_a_car);
     assert!(
         (passed - alone).abs() < 0.001,
-        "existence is {passed} after twenty have passed, {alone} if nobody has"
+        "existence is {passed} after twenty vehicles have passed, {alone} without passing vehicles"
     );
 }
 
-/// Existence of a car that `believer` states alone, with `liar` beside it or not, while two that look there see nothing.
+/// Existence of a car that `believer` reports alone or together with `liar`, while two vehicles observe an empty place.
 fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
     let mut tracker = tracker();
     tracker.sensors.dormant.keep([(
@@ -91,7 +91,7 @@ fn faulty_vehicle_is_no_second_witness() {
     let [with_liar, without] = [true, false].map(existence_of_a_ghost);
     assert!(
         with_liar < without + 0.02,
-        "{with_liar} with a liar beside, {without} without"
+        "{with_liar} with a malicious vehicle, {without} without"
     );
 }
 
@@ -121,7 +121,8 @@ fn low_trust_increases_no_existence() {
     );
 }
 
-/// The vehicle that leaves has seen a duplicate of a parked car in its last frame. The two that stay see the car a metre apart.
+/// In its last frame, the leaving vehicle detected a duplicate of a parked car. The two remaining vehicles detect the
+/// car a metre apart.
 #[test]
 fn duplicate_ends_with_its_vehicle() {
     let mut tracker = tracker();

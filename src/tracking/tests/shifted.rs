@@ -1,15 +1,16 @@
-//! Vehicles that state all places shifted, and nearly without error.
+//! Vehicles that report all positions with a shift and nearly zero covariance.
 
 use super::*;
 
-/// Vehicles that see four cars which stand or drive, of which the last `false_ones` state every place `shift_m` too far east.
+/// Vehicles that detect four standing or moving cars. The last `false_ones` report every position `shift_m` too far
+/// east.
 struct Scene {
     vehicles: usize,
     false_ones: usize,
     shift_m: f64,
     speed_mps: f64,
     has_pose: bool,
-    /// True if the false ones stand where they state, and the others move about their places.
+    /// True if the false vehicles repeat one pose, and the poses of the others vary.
     false_ones_stand: bool,
 }
 
@@ -132,7 +133,7 @@ fn shifted_vehicle_hardly_moves_map() {
     }
 }
 
-/// A vehicle that stands has more weight in what all have in common, and no more in what counts as common.
+/// A standing vehicle has a higher weight in the common motion, and the usual weight in the choice of the majority.
 #[test]
 fn standing_shifted_vehicle_is_outvoted() {
     let scene = Scene {
@@ -148,7 +149,7 @@ fn standing_shifted_vehicle_is_outvoted() {
     assert!(false_one.1 > false_one.0, "{false_one:?}");
 }
 
-/// As many as can be out-voted, all by the same shift.
+/// The largest minority, with one common shift.
 #[test]
 fn shifted_minority_moves_map_little() {
     for (vehicles, false_ones) in [(3, 1), (5, 2), (7, 3), (9, 4)] {

@@ -26,7 +26,7 @@ fn fabricating_or_hiding_costs_trust() {
         .iter()
         .filter(|object| (object.y_m - 25.0).abs() < 3.0)
         .count();
-    assert_eq!(invented, 0, "nobody believes a liar");
+    assert_eq!(invented, 0, "invented objects are not published");
 }
 
 #[test]
@@ -74,7 +74,8 @@ fn observers_precede_vehicles_that_miss() {
     assert!(history.has_room(ids[100], at(1)) && !history.has_room(ids[0], at(1)));
 }
 
-/// Four look straight at the place, and one that they otherwise agree with is sure that something is there.
+/// Four vehicles observe the place. One vehicle that otherwise agrees with them reports an object there with high
+/// confidence.
 #[test]
 fn sure_vehicle_cannot_outweigh_misses() {
     let mut tracker = tracker();
@@ -111,8 +112,8 @@ fn sure_vehicle_cannot_outweigh_misses() {
     assert!(sure(&round).len() >= 5);
 }
 
-/// A liar that comes back after everything else of it is forgotten, alone with what it says, beside a newcomer that
-/// says as much; of many others nothing is known.
+/// A malicious vehicle returns after all its other data was removed. It alone reports its object, and a newcomer alone
+/// reports another object; many other vehicles have no counts.
 #[test]
 fn distrust_survives_silence() {
     let mut tracker = tracker();
@@ -120,7 +121,7 @@ fn distrust_survives_silence() {
     let mut round = tracker.close(at(400));
     assert!(
         round.objects.is_empty() && tracker.sensors.iter().next().is_none(),
-        "all are forgotten"
+        "all vehicles are removed"
     );
     let strangers =
         (0..2 * DormantCounts::MAX).map(|n| (name(&format!("z{n}")), TrustCounts::default()));
@@ -161,7 +162,7 @@ fn least_evidence_is_forgotten_first() {
     assert_eq!(known.count(), DormantCounts::MAX - 2);
 }
 
-/// What VOTE has settled weighs in tracks too, as what the ledger says does.
+/// Evidence settled by VOTE lowers the trust in tracking, like the counts of the ledger.
 #[test]
 fn wrong_votes_lower_track_trust() {
     let mut tracker = tracker();
@@ -184,7 +185,8 @@ fn wrong_votes_lower_track_trust() {
     assert_eq!(believed, [50.0], "{:?}", round.objects);
 }
 
-/// Four honest vehicles, one that hides most objects and one that invents them; returns the right and wrong words.
+/// Four honest vehicles, one vehicle that hides most objects and one that invents objects; returns the correct and
+/// incorrect statements.
 fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let view = Some(FieldOfView {
@@ -223,7 +225,7 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     counts
 }
 
-/// Clutter of one vehicle says nothing about the detections of others.
+/// Clutter of one vehicle does not affect the detections of others.
 #[test]
 fn clutter_barely_affects_other_objects() {
     let least_existence = |invented: usize| {
@@ -254,6 +256,6 @@ fn clutter_barely_affects_other_objects() {
     let beside = least_existence(300);
     assert!(
         without > 0.5 && beside > without - 0.1,
-        "{without:.2} without, {beside:.2} beside 300 invented ones a frame"
+        "{without:.2} without, {beside:.2} with 300 invented objects a frame"
     );
 }

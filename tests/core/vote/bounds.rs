@@ -1,4 +1,4 @@
-//! What holds for whatever vehicles say, in the default mode.
+//! Properties of the default mode that are independent of the vehicles' statements.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! Confidences of every kind: what they tell is used, and what they pretend does no harm.
+//! Confidences of every kind: informative confidences are used, and false confidences do no harm.
 
 use std::time::Duration;
 
@@ -75,7 +75,7 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
 fn confidences_help_or_are_harmless() {
     let (online, refined) = accuracy(|_, _, _| 1.0);
     assert!(online > 85.0 && refined > 85.0, "{online} {refined}");
-    // The same confidence from everybody says nothing, whatever it is.
+    // A confidence that all vehicles share contains no information, whatever its value.
     let (same_online, same_refined) = accuracy(|_, _, _| 0.37);
     assert!((same_online - online).abs() < 0.2 && (same_refined - refined).abs() < 0.2);
     type Statement = fn(usize, f64, f64) -> f64;

@@ -1,5 +1,5 @@
-//! VOTE beside the majority on generated label sets: over balance of the classes, habits of the annotators, number of
-//! labels and confidences.
+//! VOTE compared with the majority on generated label sets: over balance of the classes, habits of the annotators,
+//! number of labels and confidences.
 //!
 //! All sets: `make eval-generated`. A set is drawn anew until it has enough items. VOTE falls short where it is below the
 //! expected majority by more than half a point and two standard errors of the difference, item by item.
@@ -58,7 +58,7 @@ impl Difference {
     }
 }
 
-/// One pass and passes beside the majority, and passes beside one pass.
+/// One pass and passes compared with the majority, and passes compared with one pass.
 struct Score {
     majority: f64,
     online: Difference,
@@ -111,7 +111,7 @@ fn landmark(place: usize) -> String {
     format!("item-{place:05}")
 }
 
-/// As with annotators: an item after the other, none goes stale.
+/// As with annotators: the items follow one another, and votes do not become stale.
 fn vote_on(items: &[Item]) -> Vote {
     let weighted = WeightedConfig {
         freshness_s: 1e9,
@@ -182,7 +182,8 @@ fn score(number: u64, items: usize) -> Score {
     }
 }
 
-/// Scores sets on all processors; prints those that fall short and the means. Returns the numbers of the former.
+/// Scores sets on all processors; prints the sets that fall short and the means. Returns the number of sets that fall
+/// short.
 fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
     let threads = thread::available_parallelism().map_or(1, usize::from);
     let of_thread = |thread: usize| {
@@ -231,7 +232,7 @@ fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
 
 #[test]
 fn ninth_of_sets_matches_known_deficits() {
-    // Each balance meets each habit about once in 56; every ninth meets all of both.
+    // Each balance is combined with each habit in about one of 56 sets, so a ninth of the sets covers all of them.
     let numbers: Vec<u64> = (1..SETS).step_by(9).collect();
     let unknown: Vec<_> = short_of(&numbers, 600)
         .into_iter()

@@ -1,4 +1,4 @@
-//! Who invents labels takes the room of nobody else.
+//! A vehicle that invents labels does not displace labels of other vehicles.
 
 use std::time::Duration;
 
@@ -38,7 +38,7 @@ fn vote_for(landmark: &str, label: &str) -> (String, String) {
     (landmark.to_owned(), label.to_owned())
 }
 
-/// A vehicle's round of `count` labels that nobody has heard before, each at a place of its own.
+/// A vehicle's round of `count` new labels, each at a separate place.
 fn inventions(round: u64, count: usize) -> Vec<(String, String)> {
     (0..count)
         .map(|n| (format!("nowhere-{n}"), format!("invented-{round}-{n}")))
@@ -49,7 +49,7 @@ fn inventions(round: u64, count: usize) -> Vec<(String, String)> {
 fn new_labels_survive_label_flood() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for round in 1..40 {
-        // The liar speaks first, last, and on the others' place too.
+        // The malicious vehicle reports first, last, and also at the place of the others.
         say(&mut vote, "liar", 2 * round, &inventions(2 * round, 300));
         let new = format!("thing-{}", round / 10);
         for honest in ["a", "b", "c"] {

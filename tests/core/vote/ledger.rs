@@ -1,4 +1,4 @@
-//! What a fuser that starts takes over from a ledger.
+//! The evidence that a starting fuser takes over from a ledger.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! VOTE where nothing moves: vehicles look at the same objects again and again and take a frame wrong now and then.
+//! VOTE without motion: vehicles observe the same objects repeatedly and misread a frame now and then.
 
 use std::time::Duration;
 

@@ -1,7 +1,7 @@
 //! Links to brokers, and the rounds and evidence that brokers pass on.
 //!
-//! A node publishes on every link that it keeps. Each broker passes on what its rule lets through, to all nodes that are
-//! linked to it: so rounds come twice, late, or from two leaders at once.
+//! A node publishes on every link that it keeps. Each broker forwards the messages that its rule allows, to all linked
+//! nodes: so rounds come twice, late, or from two leaders at once.
 
 use std::collections::btree_map::Entry;
 
@@ -21,7 +21,7 @@ use crate::sim::world::{MS, World};
 const LOST_SHARES_PERCENT: u64 = 10;
 
 impl World {
-    /// Makes the links what the machine wants.
+    /// Sets the links as the machine requires.
     pub(crate) fn set_links(&mut self, index: usize, wanted: &WantedLinks) {
         let is_wanted = |broker: &usize| wanted.brokers.contains(&address_of(*broker));
         self.nodes[index]
@@ -159,7 +159,7 @@ impl World {
         self.judge_vehicles(index, &map.epoch);
     }
 
-    /// A map is at a broker: it is passed on if its publisher may speak for all there.
+    /// A map arrives at a broker, which forwards it if the publisher has the right to publish there.
     pub(crate) fn relay(&mut self, broker: usize, from: usize, map: &Map) {
         let publisher = self.nodes[from].name.clone();
         let now = Timestamp(self.now).shifted(self.nodes[broker].steady_clock);
@@ -177,7 +177,8 @@ impl World {
         }
     }
 
-    /// Sends shares to all candidates that have a link to one of the brokers that the node publishes to; some are lost.
+    /// Sends shares to all candidates that have a link to one of the brokers to which the node publishes; some are
+    /// lost.
     pub(crate) fn share(&mut self, index: usize, shares: Vec<LedgerShare>) {
         let leads = self.nodes[index].lane.as_ref().map(|lane| lane.term);
         for mut share in shares {
@@ -244,7 +245,7 @@ impl World {
         }
     }
 
-    /// Checks that an accepted map may be shown to a driver: it is no repetition, none superseded, and not old.
+    /// Checks that an accepted map may be shown to a driver: it is not repeated, superseded or old.
     fn judge(&self, to: usize, map: &Map) {
         let node = &self.nodes[to];
         let age = self.now - map.made_at;
@@ -302,7 +303,7 @@ impl World {
         let Some(later) = of_this_run().find(|accepted| accepted.epoch > map.epoch) else {
             return;
         };
-        // Nobody can have forged what it published itself.
+        // A round that a node published itself is not a forgery.
         if later.epoch.leader == node.name {
             fail("it led itself in a later term");
         }

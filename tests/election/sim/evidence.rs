@@ -98,7 +98,7 @@ impl Votes {
 }
 
 impl World {
-    /// Records what a round of a node's own leadership says about vehicles.
+    /// Records the evidence about vehicles from a round of a node's own leadership.
     pub(crate) fn judge_vehicles(&mut self, index: usize, epoch: &Epoch) {
         if self.random.chance(80) {
             return;
@@ -115,7 +115,7 @@ impl World {
         self.share(index, shares);
     }
 
-    /// Shares all that a node knows.
+    /// Shares all evidence of a node.
     pub(crate) fn share_all(&mut self, index: usize) {
         let shares = self.nodes[index].resync.snapshot(&self.nodes[index].ledger);
         self.share(index, shares);
@@ -149,8 +149,8 @@ impl World {
         }
     }
 
-    /// Checks that a node has kept all that it was told of terms that its election knows. Of its present leadership only
-    /// the leader tells.
+    /// Checks that a node has kept all evidence that it received for terms of its election. Evidence of the present
+    /// leadership comes only from its leader.
     fn judge_merge(&self, to: usize, share: &LedgerShare) {
         let node = &self.nodes[to];
         let mut told = ReputationLedger::default();
@@ -177,7 +177,7 @@ impl World {
         let lacks = told.beyond(&node.ledger);
         assert!(
             lacks.0.is_empty() && lacks.1.is_empty(),
-            "{} was told {lacks:?} and does not know it",
+            "{} received {lacks:?} and does not have it",
             node.name
         );
     }
@@ -202,7 +202,7 @@ impl World {
         self.push_to(index, PUBLISH_PERIOD, Arrival::Keep);
     }
 
-    /// The other nodes that may lead, as a node's membership knows them.
+    /// The other nodes that may lead, by the node's membership.
     fn candidates(&self, of: usize) -> Vec<NodeName> {
         let members = self.nodes[of]
             .members
@@ -214,7 +214,8 @@ impl World {
             .collect()
     }
 
-    /// All that the living candidates know. Signed evidence counts if another than its aggregator passes it on.
+    /// All evidence of the running candidates. Signed evidence counts if a candidate other than its aggregator forwards
+    /// it.
     pub(crate) fn known_evidence(&self) -> ReputationLedger {
         let mut all = ReputationLedger::default();
         for (_, node) in self
@@ -232,7 +233,7 @@ impl World {
         all
     }
 
-    /// Checks that every living candidate knows all of `known`.
+    /// Checks that every running candidate has all evidence in `known`.
     pub(crate) fn everyone_knows(&self, known: &ReputationLedger) -> Result<(), String> {
         for (_, node) in self
             .alive()
@@ -251,13 +252,13 @@ impl World {
         for (_, node) in self.alive() {
             if let Some(entry) = node.ledger.entries().find(|entry| !self.votes.hold(entry)) {
                 return Err(format!(
-                    "{} counts votes that nobody settled: {entry:?}",
+                    "{} counts votes that were not settled: {entry:?}",
                     node.name
                 ));
             }
             if let Some(mark) = node.ledger.marks().find(|mark| !self.votes.passed(mark)) {
                 return Err(format!(
-                    "{} has a mark that nobody reached: {mark:?}",
+                    "{} has a mark that was not reached: {mark:?}",
                     node.name
                 ));
             }

@@ -65,8 +65,8 @@ fn longest_gap(node: &Node, from: u64, now: u64) -> Result<Option<u64>, String> 
     Ok(times.windows(2).map(|pair| pair[1] - pair[0]).max())
 }
 
-/// The largest gap between two accepted rounds of any vehicle that a split cuts off from the leader, in µs; `None` if
-/// none is, or none of them may lead.
+/// The largest gap between two accepted rounds of any vehicle that a split cuts off from the leader, in µs; `None`
+/// without such a vehicle, or if none of the cut-off nodes may lead.
 pub(super) fn split_gap(seed: u64) -> Option<u64> {
     let mut world = cell(seed);
     start_all(&mut world);

@@ -13,10 +13,11 @@ use super::{SECOND, cell, check, ensure, for_seeds, one_best_leader, seeds, star
 use crate::sim::node::Fault;
 use crate::sim::world::{MS, World};
 
-/// First sequence number of the false messages. It is so large that all nodes drop the later genuine messages of the sender.
+/// First sequence number of the false messages. The number is so large that all nodes drop the later genuine messages
+/// of the sender.
 const FORGED: u64 = 1 << 40;
 
-/// The lead stays where it is, and every honest node gets its rounds, while one in twenty packets is lost.
+/// The leader stays, and every honest node receives its rounds, while one in twenty packets is lost.
 #[test]
 fn false_claim_takes_no_lead() {
     for_seeds(seeds() / 10, |seed| {
@@ -64,8 +65,8 @@ fn false_claim_takes_no_lead() {
     });
 }
 
-/// The leader hangs, and a member answers each question about it with "it is alive": it takes as long as without the member
-/// until another node leads. The member has the leader's last sign of life, and can make none.
+/// The leader hangs, and a member answers each query about it with "it is alive". Another node leads after the same
+/// time as without the member, because the member has the leader's last sign of life and cannot create a new one.
 #[test]
 fn vouched_hung_leader_is_replaced() {
     for_seeds(seeds() / 5, |seed| {
@@ -113,7 +114,7 @@ fn vouched_hung_leader_is_replaced() {
                 world.run_for(20 * MS);
                 ensure(
                     world.now - hung_at <= SECOND,
-                    "nobody has taken over after a second",
+                    "no node has taken over after a second",
                 )?;
             }
             Ok(())
@@ -351,8 +352,9 @@ struct Outcome {
 /// Longest time without a map at an honest vehicle.
 const MAX_GAP: u64 = SECOND;
 
-/// A member sends one kind of false message for seconds, while the leader works, and then while it hangs: no honest
-/// vehicle is without maps for a second, and every map that it accepts is judged. Prints the table of messages and lies.
+/// A member sends one kind of false message for seconds, first while the leader works, then while it hangs: every
+/// honest vehicle receives maps without a gap of a second, and every accepted map is judged. Prints the table of
+/// messages and attacks.
 #[test]
 fn false_claims_cost_no_maps() {
     let mut outcomes = [Outcome::default(); LIES.len()];

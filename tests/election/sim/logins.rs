@@ -56,7 +56,7 @@ fn leader_refusing_most_logins_yields() {
     });
 }
 
-/// The standby is reached by its messages only when its leader is killed: it leads, and hands the lead on.
+/// The leader dies while the standby's broker refuses most logins. The standby leads, then hands over.
 #[test]
 fn followers_skip_unreachable_successor() {
     for_seeds(seeds() / 10, |seed| {
@@ -116,7 +116,8 @@ fn unreachable_standby_delays_no_takeover() {
     });
 }
 
-/// One node that cannot log in, or says so, ends no leadership that others follow, or that it does not equal.
+/// A single node that cannot log in, or claims so, does not end a leadership if other nodes follow it or if the leader
+/// outranks that node.
 #[test]
 fn one_failed_login_moves_no_lead() {
     for_seeds(seeds() / 10, |seed| {

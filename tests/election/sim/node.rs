@@ -24,11 +24,12 @@ use uuid::Uuid;
 pub(crate) enum Fault {
     /// The process starts, with its disk.
     Start(usize),
-    /// The process ends; others see broken connections and a refusing port when told so, else only silence.
+    /// The process ends. With `seen`, other nodes observe broken connections and a refusing port, otherwise only
+    /// silence.
     Kill { node: usize, seen: bool },
-    /// The process is stopped in good order; its own word is the first that others hear of it.
+    /// The process stops in order; its farewell is the first sign of it for the other nodes.
     Leave(usize),
-    /// The process does nothing for so many µs.
+    /// The process stalls for so many µs.
     Pause { node: usize, micros: u64 },
     /// The node's clock is set by so many µs.
     SetClock { node: usize, micros: i64 },
@@ -44,7 +45,7 @@ pub(crate) enum Fault {
     Broker { node: usize, works: bool },
     /// The node's fuser closes no rounds, or does again.
     Fuser { node: usize, works: bool },
-    /// The node's gateway answers nobody, or does again.
+    /// The node's gateway stops answering, or answers again.
     Gateway { node: usize, works: bool },
     /// A node cannot log in at another's broker, such as by a firewall or a certificate, until all links work again.
     NoLogin { node: usize, broker: usize },
@@ -122,7 +123,7 @@ pub(crate) struct Map {
     pub(crate) round: u64,
     /// Time of its fusion by its publisher's clock.
     pub(crate) fused_at: Timestamp,
-    /// The same by the simulation's, in µs.
+    /// The same time on the simulation's clock, in µs.
     pub(crate) made_at: u64,
 }
 
@@ -150,7 +151,7 @@ pub(crate) struct Node {
     pub(crate) signs: bool,
     /// True if ledgers survive the process; terms do in any case.
     pub(crate) has_disk: bool,
-    /// The leadership as the machine told it.
+    /// The leadership as reported by the machine.
     pub(crate) leadership: Leadership,
     pub(crate) accepted: Vec<Accepted>,
     pub(crate) refused: u64,
@@ -159,7 +160,7 @@ pub(crate) struct Node {
     pub(crate) persisted: u64,
     /// Difference between the node's clock, which may be set, and the time of the simulation, in µs.
     pub(crate) clock: i64,
-    /// The same when the process started: its rounds are dated by a clock that nobody sets.
+    /// This difference at the start of the process. Its rounds are dated by a steady clock, which cannot be set.
     pub(crate) steady_clock: i64,
     pub(crate) armed: u64,
     pub(crate) paused_until: u64,
@@ -174,11 +175,11 @@ pub(crate) struct Node {
     pub(crate) gateway_works: bool,
     /// Rounds that the fuser closed before it last stopped or started, and when that was.
     pub(crate) closed: (u64, u64),
-    /// State of the links that the machine wants, by node.
+    /// State of the links that the machine requires, by node.
     pub(crate) links: BTreeMap<usize, LinkState>,
-    /// Nodes that the membership is about to tell of, and their runs.
+    /// Nodes that the membership is about to report, and their runs.
     pub(crate) known: BTreeMap<usize, u64>,
-    /// Nodes that the membership has told of, and their runs.
+    /// Nodes that the membership has reported, and their runs.
     pub(crate) members: BTreeMap<usize, u64>,
     pub(crate) packets: u64,
 }

@@ -221,7 +221,7 @@ impl World {
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),
             Arrival::Share { share } => self.take_share(to, &share),
-            // A membership tells its news in order.
+            // A membership reports its events in order.
             Arrival::Tell {
                 about,
                 about_life,
@@ -419,7 +419,7 @@ impl World {
         }
     }
 
-    /// Hands in what happened and carries out what comes of it, as the actors do.
+    /// Passes an event to the machine and carries out the effects, like the actors.
     pub(crate) fn handle(&mut self, index: usize, input: Input) {
         let mut inputs = VecDeque::from([input]);
         while let Some(input) = inputs.pop_front() {
@@ -434,7 +434,7 @@ impl World {
         self.arm(index);
     }
 
-    /// Does what the machine wants; returns what it is to be told at once.
+    /// Carries out an effect of the machine; returns the inputs that follow at once.
     fn carry_out(&mut self, index: usize, effect: Effect) -> Option<Input> {
         match effect {
             Effect::PersistTerm { term } => self.nodes[index].persisted = term,
@@ -461,7 +461,7 @@ impl World {
                 );
                 assert!(
                     self.nodes[index].leadership.is_leading(),
-                    "leads before it is told"
+                    "leads before the machine reports it"
                 );
                 let owner = self
                     .owners

@@ -395,7 +395,7 @@ impl ElectionDriver {
             .as_ref()
             .filter(|(leader, _)| leadership.leader() == Some(leader));
         if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
-            let cause = format!("{leader} says of this node: {cause}");
+            let cause = format!("reported by {leader}: {cause}");
             troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
         }
         if let Some(credentials) = self.life_signs.credentials() {

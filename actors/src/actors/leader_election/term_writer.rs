@@ -40,8 +40,8 @@ pub(super) enum TermState {
     NoDisk,
 }
 
-/// Maximum term that is accepted from a disk; a cell would need more than a thousand years to reach
-/// it. Earlier versions wrote forged terms, which left no room for elections.
+/// Maximum term that is accepted from a disk. Larger terms are ignored as forged: a cell would need
+/// over 1000 years to reach this value.
 const MAX_SAVED_TERM: u64 = 1 << 40;
 
 /// The term that the last run of the node saved; 0 without any.
@@ -58,7 +58,7 @@ pub fn saved_term(file: Option<&StateFile>) -> u64 {
 
 impl TermWriter {
     /// Creates a writer. After it is dropped, it ends once the last term is on disk. Without a file
-    /// it does nothing.
+    /// its calls have no effect.
     pub(super) fn new(file: Option<StateFile>) -> Self {
         let (wanted, terms) = watch::channel(0);
         let (answers, answer) = watch::channel(DiskAnswer::default());

@@ -1,5 +1,5 @@
 //! Renewal of certificates over the membership: each node requests its own, and nodes that have the
-//! key of the cell's CA issue those of others.
+//! key of the cell's CA issue the certificates of other nodes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -42,7 +42,7 @@ impl ReputationStore {
     }
 
     /// Loads saved evidence, within the bounds for other nodes' evidence. If evidence is signed,
-    /// `signer` verifies it. `date` is the current time; a clock that was never set is not used for
+    /// `signer` verifies it. `date` is the current time; an unset clock is not used for
     /// checks.
     fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
         let Saved {

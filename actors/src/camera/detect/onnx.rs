@@ -199,7 +199,7 @@ pub enum OnnxError {
         /// The configured family, or all.
         family: String,
     },
-    /// The model has another task than to find boxes.
+    /// The model is not an object detector.
     #[error(
         "model {path:?} is a model for {task}, but a node needs boxes parallel to the image's edges: export a model for detection"
     )]
@@ -243,7 +243,7 @@ pub enum OnnxError {
         /// Number of its first class.
         first: usize,
     },
-    /// The names in the metadata are not as many as the outputs have classes.
+    /// The number of names in the metadata differs from the number of classes in the outputs.
     #[error(
         "model {path:?} has {names} names in its metadata, but {outputs} are for {classes} classes: export a model for detection, without other values beside boxes and scores"
     )]
@@ -325,8 +325,8 @@ pub struct OnnxDetector {
     config: OnnxConfig,
     network: Network,
     head: Head,
-    /// True if boxes of the background, where class 0 is it, are usual and not objects: the network
-    /// scores it among the classes.
+    /// True if class 0 is the background and the network scores it like other classes. Boxes of the
+    /// background are then ignored and are no error.
     finds_background: bool,
     /// By the network's numbers; `None` for numbers without a class.
     classes: Vec<Option<Class>>,
@@ -339,11 +339,11 @@ impl OnnxDetector {
     /// Returns an [`OnnxError`] with the file and the remedy.
     pub fn new(config: OnnxConfig) -> Result<Self, OnnxError> {
         let path = &config.model;
-        let told = config.input_px.map(|[width, height]| ImageSize {
+        let configured = config.input_px.map(|[width, height]| ImageSize {
             width: width.into(),
             height: height.into(),
         });
-        let network = Network::load(path, told)?;
+        let network = Network::load(path, configured)?;
         if let Some(task) = network.metadata("task").and_then(other_task) {
             return Err(OnnxError::OtherTask {
                 path: path.clone(),
@@ -360,7 +360,7 @@ impl OnnxDetector {
         let size = network.input_size();
         let outputs = network
             .run(vec![0.0; 3 * size.width as usize * size.height as usize])
-            .map_err(|reason| match told {
+            .map_err(|reason| match configured {
                 Some(size) => OnnxError::RefusedSize {
                     path: path.clone(),
                     size,

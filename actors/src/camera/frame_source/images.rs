@@ -9,7 +9,7 @@ use crate::platform::clock;
 
 const EXTENSIONS: [&str; 7] = ["bmp", "jpeg", "jpg", "pgm", "png", "ppm", "webp"];
 
-/// Maximum number of digits in the names of a pattern: those of the largest number.
+/// Maximum number of digits in the names of a pattern: the digits of the largest number.
 const MAX_DIGITS: usize = 20;
 
 /// Images in the order of their names.

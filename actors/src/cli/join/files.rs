@@ -97,7 +97,7 @@ impl NodeDirectory {
         }
     }
 
-    /// Replaces the certificates of the node in the directory by those of an invitation, such as
+    /// Replaces the certificates of the node in the directory by the certificates of an invitation, such as
     /// after their end.
     pub(super) fn renew(
         &self,

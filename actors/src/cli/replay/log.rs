@@ -266,7 +266,7 @@ fn print_rerun(rerun: &JournalReplay) {
     }
     if summary.continued {
         eprintln!(
-            "the log begins in the middle of a run: its first rounds use less evidence than the live ones did"
+            "the log begins in the middle of a run: so its first rounds lack evidence that the live node had"
         );
     }
     if summary.missing > 0 {

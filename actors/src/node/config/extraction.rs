@@ -88,7 +88,7 @@ fn from_environment(error: &figment::Error) -> bool {
         .is_some_and(|metadata| metadata.name.contains("environment variable"))
 }
 
-/// Keys whose values are never shown.
+/// Keys whose values are hidden.
 const SECRETS: [&str; 5] = ["password", "key", "token", "url", "pipeline"];
 
 /// Every error with its key and where it was read, and without any secret.

@@ -39,7 +39,7 @@ impl NodeConfig {
         format!("another node joins by `ecod-node invite {directory}NAME`")
     }
 
-    /// How reports come to a node that has none, whose broker listens at `door`.
+    /// How to send reports to a node without reports, whose broker listens at `door`.
     pub fn reporting(&self, door: Option<SocketAddr>) -> String {
         let name = self.name.as_ref().map_or("NAME", |name| name.as_str());
         let programs = match door.filter(|_| self.broker.door) {

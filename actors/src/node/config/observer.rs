@@ -8,7 +8,7 @@ use crate::transport::pki::OBSERVER_MARK;
 
 impl NodeConfig {
     /// The configuration of an observer that runs in addition to the node, for some purpose: it
-    /// cannot lead, has no camera and keeps no state. Its name is below that of the node, so that
+    /// cannot lead, has no camera and keeps no state. Its name is below the name of the node, so that
     /// other nodes do not count it as a node.
     ///
     /// # Errors

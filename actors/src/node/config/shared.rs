@@ -253,8 +253,8 @@ impl SharedConfig {
 }
 
 impl NodeConfig {
-    /// True sizes of objects: those of the first camera, which a description has overlaid, or
-    /// without a camera those of the text of a description.
+    /// True sizes of objects: the sizes of the first camera, which a description has overlaid, or
+    /// without a camera the sizes in the text of a description.
     pub(in crate::node) fn object_sizes(&self, description: Option<&str>) -> ObjectSizes {
         #[cfg(feature = "camera")]
         if let Some(camera) = self.all_cameras().next() {

@@ -23,7 +23,7 @@ use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 #[derive(Debug, Default)]
 pub struct LiveState {
     reports: [AtomicU64; ReportKind::COUNT],
-    /// True if browsers want reports, and if local programs do.
+    /// True if browsers request reports, and if local programs do.
     wants_reports: [AtomicBool; 2],
     latest: Mutex<Latest>,
     expected: Mutex<ExpectedNodes>,
@@ -161,7 +161,7 @@ impl LiveState {
         self.wants_reports[0].store(wanted, Relaxed);
     }
 
-    /// Records whether local programs want reports.
+    /// Records whether local programs request reports.
     pub fn set_programs_want_reports(&self, wanted: bool) {
         self.wants_reports[1].store(wanted, Relaxed);
     }

@@ -243,7 +243,7 @@ fn rounds(registry: &mut Registry, monitor: &NodeMonitor) {
             "Known locations in the newest map",
             count(newest.map.landmarks.len()),
         );
-        let objects = "Objects in the newest map beside known locations";
+        let objects = "Objects in the newest map that are not at a known location";
         gauge(
             registry,
             "map_objects",

@@ -1,4 +1,4 @@
-//! Clients that have recently left: what they have published may still be in use when their
+//! Clients that have recently left: their publications may still be in use when their
 //! certificates are revoked.
 
 use std::collections::BTreeMap;

@@ -313,7 +313,7 @@ impl MqttBroker for EmbeddedBroker {
         };
         let told = stop.send(()).is_ok();
         if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
-            tracing::error!(%address, "broker hangs and is left to itself");
+            tracing::error!(%address, "embedded broker does not answer; its thread is abandoned");
         } else if thread.join().is_err() || !told {
             tracing::warn!(%address, "broker had ended by itself");
         }

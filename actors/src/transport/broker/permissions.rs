@@ -259,7 +259,7 @@ impl Handler for Permissions {
                     SubscribeAckReason::TopicFilterInvalid,
                 ))
             }
-            // QoS 0: an acknowledgement that is never sent would hold messages in memory.
+            // QoS 0: a missing acknowledgement would hold messages in memory.
             Parameter::ClientSubscribeCheckAcl(..) => HookResult::SubscribeAclResult(
                 SubscribeAclResult::new_success(QoS::AtMostOnce, None),
             ),

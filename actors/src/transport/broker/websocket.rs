@@ -114,7 +114,7 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
     }
 }
 
-/// True if an HTTP request asks for another protocol than HTTP.
+/// True if an HTTP request requests another protocol than HTTP.
 fn asks_for_upgrade(request: &[u8]) -> bool {
     let name = b"upgrade:";
     request

@@ -64,7 +64,7 @@ pub(crate) enum FrameKind {
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Handshake {
-    /// Asks the greeting node to prove that it is reachable.
+    /// Requests that the greeting node prove that it is reachable.
     Challenge {
         /// Cookie to be returned.
         cookie: Cookie,

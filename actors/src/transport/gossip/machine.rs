@@ -590,7 +590,7 @@ impl GossipMachine {
                 .push_back(GossipOutput::Tell(MembershipEvent::Excluded));
         }
         let cause = format!(
-            "another run of this name takes part, says the node at {informant}; this run does not"
+            "the node at {informant} reports that another running node has this name; this node does not join"
         );
         let name = self.gossip.own().name.clone();
         self.report_taken(&name, cause, at);
@@ -666,7 +666,7 @@ const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The trouble of a second run at an address, as text.
 fn second_run(at: SocketAddr) -> String {
-    format!("a second run of this name, at {at}, does not take part; the first one does")
+    format!("a second node of this name at {at} is refused; the first one remains")
 }
 
 #[cfg(test)]

@@ -232,7 +232,7 @@ impl Sessions {
         may_send
     }
 
-    /// Ends the session of an earlier run of a node; returns false if there is none. For a node
+    /// Ends the session of an earlier run of a node; returns false without such a session. For a node
     /// that proves its certificate, only its own handshake can do so.
     pub(crate) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         !self.prove_certificates() && self.peers.end_earlier_run(name, run, now)
@@ -390,7 +390,7 @@ impl Sessions {
     /// Records a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
         let cause = format!(
-            "heard cell {} with another key, or none, from {}",
+            "received a datagram of cell {} with another key or none from {}",
             self.cell,
             from.ip()
         );
@@ -408,7 +408,7 @@ impl Sessions {
         };
         if !are_numbered(other, &self.cell) || arrival.is_alone {
             let cause = format!(
-                "heard cell {other} from {}, this is {}",
+                "received a datagram of cell {other} from {}; this node is in {}",
                 arrival.from.ip(),
                 self.cell
             );

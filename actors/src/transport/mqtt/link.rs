@@ -202,7 +202,7 @@ impl LinkTask {
             tracing::debug!(broker = %self.broker, %error, "link lost");
             match self.setup.security.clock_fault() {
                 Some(fault) if !std::mem::replace(&mut self.has_reported_clock, true) => {
-                    tracing::warn!(broker = %self.broker, "{fault}; the node tries on, and goes on by itself then");
+                    tracing::warn!(broker = %self.broker, "{fault}; the node keeps trying and connects once this is corrected");
                 }
                 Some(_) => {}
                 None => self.has_reported_clock = false,

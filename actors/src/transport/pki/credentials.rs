@@ -46,7 +46,7 @@ pub struct Credentials {
     changed: Notify,
     /// The reason why a certificate that ends soon is not renewed yet.
     unrenewed: Mutex<Option<String>>,
-    /// True while the machine's clock is found to be wrong, by which nothing is renewed.
+    /// True while the machine's clock is found to be wrong, which suspends renewals.
     is_clock_wrong: AtomicBool,
 }
 
@@ -448,7 +448,7 @@ fn authorities(
     }
 }
 
-/// Reads revocation lists. A file without any, for example one that was copied incompletely, is an
+/// Reads revocation lists. A file without any, for example an incomplete copy, is an
 /// error and not an empty list.
 fn lists(
     key: &'static str,

@@ -27,7 +27,7 @@ use crate::platform::clock;
 /// A datagram of the conversation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum RenewalMessage {
-    /// The sender asks for a certificate with its name and rights for a new key: a certificate
+    /// The sender requests a certificate with its name and rights for a new key: a certificate
     /// signing request in DER, of which only the key counts.
     Request(Vec<u8>),
     /// The new certificate in DER.
@@ -61,7 +61,7 @@ impl NewKey {
     /// Replaces the node's certificate and key by a new certificate and this key.
     ///
     /// # Errors
-    /// Returns an error if the certificate is not the present one with another key and a later end,
+    /// Returns an error if the certificate is not the present certificate with another key and a later end,
     /// or the files cannot be written.
     pub(crate) fn install(
         &self,
@@ -72,7 +72,7 @@ impl NewKey {
         credentials.replace(certificate, self.key.public_key_raw(), &secret)
     }
 
-    /// Replaces the node's certificate, which may have ended, by one of a CA on this machine.
+    /// Replaces the node's certificate, which may have ended, by a certificate of a CA on this machine.
     ///
     /// # Errors
     /// Returns the reason as text.

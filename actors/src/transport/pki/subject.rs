@@ -36,7 +36,7 @@ pub enum InvalidCertificate {
     /// Not an X.509 certificate.
     #[error("not an X.509 certificate")]
     Malformed,
-    /// The certificate has no common name, several ones, or one that is not a node's name.
+    /// The certificate has no common name, several common names, or a name that is not valid for a node.
     #[error("the certificate's common name is not the name of a node")]
     NoName,
     /// Role and priority that cannot be understood.

@@ -1,4 +1,4 @@
-//! The same with processes of their own.
+//! The tests of `failover` with separate processes.
 
 use std::fs::File;
 use std::net::SocketAddr;
@@ -87,7 +87,7 @@ fn vehicles_survive_edge_kill() {
     edge_is_killed(&directory);
 }
 
-/// The same with TLS between all: a broken connection and a refused port say as much as they do without.
+/// With TLS, a broken connection and a refused port are detected as quickly as without TLS.
 #[test]
 fn certified_vehicles_survive_edge_kill() {
     let directory = tempfile::tempdir().unwrap();
@@ -100,8 +100,8 @@ fn certified_vehicles_survive_edge_kill() {
     edge_is_killed(&directory);
 }
 
-/// A second run under the name of a running vehicle takes no part: it says why, and ends by itself with a code of its
-/// own. Neither its coming nor its going touches the lead or costs a map.
+/// A second process with the name of a running vehicle does not join, logs the reason, and exits with a separate code.
+/// Its start and its end do not affect the leadership or delay a map.
 #[test]
 fn second_process_of_name_exits() {
     let directory = tempfile::tempdir().unwrap();
@@ -133,7 +133,7 @@ fn second_process_of_name_exits() {
         let reason =
             "another running node of the cell cell is called euclid: give one of them another name";
         assert!(said.contains(reason), "{said}");
-        // By itself it may lead itself, until it has heard long enough that its name is taken.
+        // It may lead alone until it has received long enough that its name is taken.
         assert_ne!(
             Record::read(&elsewhere.path().join("euclid.maps")).source(),
             Some("edge"),
@@ -146,7 +146,10 @@ fn second_process_of_name_exits() {
     record.misses_and_repeats_none_after(before, "edge");
     let epochs = record.epochs_from(before, "edge");
     assert_eq!(epochs.len(), 1, "{epochs:?}");
-    eprintln!("longest gap beside a namesake {:?}", record.longest_gap());
+    eprintln!(
+        "longest gap with a second node of the name {:?}",
+        record.longest_gap()
+    );
     assert!(
         record.longest_gap() < Duration::from_secs(1),
         "{:?}",
@@ -175,7 +178,7 @@ fn edge_is_killed(directory: &TempDir) {
     until("the edge serves all", &|record| {
         !record.is_empty() && record.source() == Some("edge")
     });
-    // Time to be told who stands by, and to connect to it.
+    // Time until the node has the name of the standby and a connection to it.
     std::thread::sleep(Duration::from_secs(2));
     drop(edge);
     until("a vehicle serves all", &|record| {

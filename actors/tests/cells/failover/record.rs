@@ -1,4 +1,4 @@
-//! What a node took, as its map log tells.
+//! The maps that a node accepted, by its map log.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -54,7 +54,7 @@ impl Record {
         self.maps.windows(2).map(gap).max().unwrap_or_default()
     }
 
-    /// Neither does an epoch, nor within one a round.
+    /// Epochs do not repeat, and rounds within an epoch do not repeat.
     #[track_caller]
     pub(crate) fn never_goes_back(&self) {
         let place = |received: &ReceivedMap| {
@@ -73,9 +73,9 @@ impl Record {
         }
     }
 
-    /// From the round on every one was taken, whoever published it, and once: also when the lead was given back to
-    /// `owner`, who has it in the end. Only where another leader was not heard in time, as on a machine that stood still,
-    /// may its successor have published rounds again: that is a failover, and no handover.
+    /// From the first round on, every round was accepted exactly once from any publisher, including the handover back
+    /// to `owner`, which leads at the end. Only if a leader was not received in time, for example on a stalled machine,
+    /// may its successor have published rounds again: that is a failover and not a handover.
     #[track_caller]
     pub(crate) fn misses_and_repeats_none_after(&self, round: u64, owner: &str) {
         let rounds: Vec<_> = self

@@ -1,4 +1,4 @@
-//! Real nodes, each on a runtime of its own, and plain MQTT clients at their doors.
+//! Real nodes, each on a separate runtime, and plain MQTT clients at their doors.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -53,7 +53,8 @@ impl Cell {
         }
     }
 
-    /// An edge, two vehicles that may lead, and one that may not; all follow the edge, and gauss stands by.
+    /// An edge, two vehicles that may lead, and one vehicle that may not. All follow the edge, and gauss is the
+    /// standby.
     pub(crate) async fn of_four() -> Self {
         Self::of_four_with(|_| ()).await
     }
@@ -92,7 +93,7 @@ impl Cell {
         self.until(&format!("{name} serves all"), all).await;
     }
 
-    /// Waits until every node knows this node as the standby, and has a link to it.
+    /// Waits until every node has this node as the standby, and a link to it.
     pub(crate) async fn stands_by(&self, name: &str) {
         let standby = |node: &NodeHandle| {
             node.leadership()
@@ -415,7 +416,7 @@ impl Program {
             .await;
     }
 
-    /// Votes for a car at a known location.
+    /// Votes for a car at a landmark.
     pub(crate) async fn vote(&self, name: &str, seq: u64, landmark: &str) {
         let car = PerceivedObject::new("car", 0.9, 0.0, 0.0);
         self.send(

@@ -127,7 +127,7 @@ async fn outputs_survive_leader_kill() {
             .all(|display| votes_of(display, "edge", "euclid") > 3)
     })
     .await;
-    // The last votes become evidence, which the edge tells the others.
+    // The last votes become evidence, which the edge sends to the others.
     sleep(Duration::from_secs(3)).await;
     let before: Vec<_> = displays
         .iter()
@@ -170,7 +170,7 @@ async fn outputs_survive_leader_kill() {
             .collect();
         assert_eq!(by, leaders(["edge", "gauss"]));
         let last = |node: &str| messages::<NodeStatus>(display, &format!("nodes/{node}")).pop();
-        cell.until("each status tells who leads", |_| {
+        cell.until("each status states the leader", |_| {
             let is = |node, state| last(node).is_some_and(|status| status.state == state);
             let follows = |node| {
                 last(node).is_some_and(|status| {

@@ -1,4 +1,4 @@
-//! A node in a process of its own: what the process costs, and what it logs.
+//! A node in a separate process: costs and log of the process.
 
 use std::fs::{self, File};
 use std::net::SocketAddr;
@@ -10,7 +10,7 @@ use tokio::time::{Instant, sleep};
 
 use crate::door::cell::PATIENCE;
 
-/// A node in a process of its own, with its files.
+/// A node in a separate process, with its files.
 pub(crate) struct Node {
     process: Child,
     directory: TempDir,
@@ -42,7 +42,7 @@ impl Node {
         fs::read_to_string(self.directory.path().join("log")).unwrap()
     }
 
-    /// Address of the door, as soon as the log tells it.
+    /// Address of the door, as soon as the log contains it.
     pub(crate) async fn door(&self) -> SocketAddr {
         let started = Instant::now();
         loop {

@@ -1,4 +1,4 @@
-//! Programs that subscribe to everything and never read.
+//! Programs that subscribe to everything without reading.
 
 use std::time::Duration;
 
@@ -9,11 +9,11 @@ use tokio::time::{Instant, sleep};
 use crate::door::cell::{PATIENCE, Program};
 use crate::door::process::Node;
 
-/// Programs that never read, and megabytes that they are sent each.
+/// Number of programs that do not read, and megabytes that each is sent.
 const READERS: usize = 8;
 const MEGABYTES: usize = 40;
 
-/// Most memory that they may cost the node: 2 MiB each, and what is on its way.
+/// Most memory that these programs may cost the node: 2 MiB each, and the messages in transit.
 const MAX_GROWN_KIB: u64 = 28 * 1024;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -31,7 +31,7 @@ async fn slow_programs_cost_bounded_memory() {
         );
         let (client, mut events) = AsyncClient::new(options, 4);
         client.subscribe("#", QoS::AtMostOnce).await.unwrap();
-        // Login and subscription; then nobody polls.
+        // Login and subscription without further polling.
         for _ in 0..4 {
             events.poll().await.unwrap();
         }

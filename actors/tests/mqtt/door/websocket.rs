@@ -1,4 +1,4 @@
-//! Pages beside nodes: MQTT over WebSocket at the same door.
+//! Pages next to nodes: MQTT over WebSocket at the node's door.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -88,7 +88,9 @@ async fn hear(socket: &mut Socket, wanted: &[u8]) -> Vec<u8> {
             );
         }
     };
-    timeout(PATIENCE, hearing).await.expect("not heard");
+    timeout(PATIENCE, hearing)
+        .await
+        .expect("no message arrived");
     heard
 }
 
@@ -135,7 +137,7 @@ async fn page_works_like_any_program() {
         assert!(seq < 400, "the report never came to the map");
     }
     hear(&mut page, br#""contributors":["edge"]"#).await;
-    // The rights are the same, too.
+    // The rights are equal, too.
     page.send(Message::binary(packet(
         0x30,
         b"",
@@ -229,7 +231,7 @@ async fn non_mqtt_messages_end_connection() {
     ends(vec![Message::text("hello")]).await;
     ends(vec![Message::binary(vec![0x30; 1024 * 1024])]).await;
     ends(vec![Message::Ping(vec![0; 125].into()); 2000]).await;
-    // A message of nothing that never ends.
+    // An empty message without end.
     let part = |kind| Message::Frame(Frame::message(Vec::new(), OpCode::Data(kind), false));
     ends([vec![part(Data::Binary)], vec![part(Data::Continue); 30_000]].concat()).await;
     let mut honest = page(door).await;

@@ -11,7 +11,7 @@ use crate::gateway::cell::until;
 
 #[tokio::test]
 async fn busy_port_is_reported() {
-    // An address of its own: on another a port that was let go may be somebody else's at once.
+    // A separate address: a released port of a shared address may be in use by another test at once.
     let own = SocketAddr::from(([127, 0, 21, 1], 0));
     let broker = Box::new(EmbeddedBroker::new(BrokerConfig::default()));
     let (actor, handle) = Actor::spawn(None, Broker, broker).await.unwrap();

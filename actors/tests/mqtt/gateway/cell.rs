@@ -68,7 +68,7 @@ impl Node {
         node
     }
 
-    /// A vehicle with the settings of a node that nobody configured.
+    /// A vehicle with the settings of an unconfigured node.
     pub(crate) async fn follower(node: &str, broker: &BrokerAddress) -> Self {
         let role = SubscriptionRole::Follower;
         Self::join(node, role, MqttConfig::default(), &[broker]).await
@@ -194,7 +194,7 @@ pub(crate) async fn until(what: &str, reached: impl Fn() -> bool) {
         .unwrap_or_else(|_| panic!("never reached: {what}"));
 }
 
-/// A client that knows nothing of ECOD.
+/// A plain client without ECOD's code.
 pub(crate) struct Stranger {
     client: AsyncClient,
     events: rumqttc::EventLoop,

@@ -1,4 +1,4 @@
-//! Junk from the network: each kind is counted under its own reason and nothing else happens.
+//! Junk from the network: each kind is counted under its own reason, without further effects.
 
 use std::collections::BTreeMap;
 

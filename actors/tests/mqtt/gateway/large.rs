@@ -12,7 +12,7 @@ use crate::gateway::cell::{
     LOOPBACK, Node, Stranger, edge_and_vehicle, embedded, map, name, topic, until,
 };
 
-/// A map as it is when every location is known to four vehicles.
+/// A map in which four vehicles contribute to every landmark.
 fn large_map(round: u64, landmarks: usize) -> Arc<GlobalMap> {
     let vehicles: Vec<_> = ["euclid", "gauss", "galileo", "riemann"].map(name).into();
     let state = |n: usize| LandmarkState {

@@ -32,7 +32,7 @@ async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {
     .await;
 }
 
-/// A node's subscription is known to be in force once another's retained status has come through it.
+/// A node's subscription is active once another node's retained status has arrived through it.
 async fn settle(receiver: &mut Node, sender: &Node) {
     sender.send(GatewayMessage::PublishStatus {
         status: sender.status.clone(),
@@ -114,7 +114,7 @@ async fn user_and_password_are_presented() {
         assert_eq!(
             intruder.counters.events(Event::BrokerRefused),
             1,
-            "told of once, not with every attempt"
+            "reported once, not with every attempt"
         );
     }
 }
@@ -146,11 +146,11 @@ async fn silent_publish_refusal_is_reported() {
             &[&denied.address()],
         )
         .await;
-        until("told of the refusal", || {
+        until("the refusal is reported", || {
             euclid.counters.events(Event::BrokerRefused) == 1
         })
         .await;
-        until("gauss hears itself", || {
+        until("gauss receives its own message", || {
             gauss.counters.events(Event::Echo) > 0
         })
         .await;
@@ -167,7 +167,7 @@ async fn stall_accuses_no_broker() {
     };
     let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[&address]).await;
     std::thread::sleep(Duration::from_millis(300));
-    until("euclid hears itself", || {
+    until("euclid receives its own message", || {
         euclid.counters.events(Event::Echo) > 0
     })
     .await;
@@ -306,7 +306,7 @@ async fn missing_echoes_reveal_hanging_broker() {
     for version in [MqttVersion::V311, MqttVersion::V5] {
         let broker = Mosquitto::start();
         let address = broker.address();
-        // Long enough for the protocol's own signs of life to tell nothing in here.
+        // Long enough that the protocol's own keep-alive does not occur in this time.
         let mqtt = MqttConfig {
             version,
             keep_alive_s: 600,
@@ -323,7 +323,7 @@ async fn missing_echoes_reveal_hanging_broker() {
         tokio::time::sleep(Duration::from_secs(2)).await;
         broker.freeze();
         let frozen = Instant::now();
-        // Whatever was said of the link so far is that it came up: that was taken by `join`.
+        // The only event of the link so far is that it came up, which `join` consumed.
         let stalled = edge.next(|message| match message {
             Incoming::Link { state, .. } => Some(*state),
             _ => None,

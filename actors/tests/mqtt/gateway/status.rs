@@ -89,7 +89,7 @@ async fn living_namesakes_are_reported() {
         })
         .await;
     }
-    // Whatever was said in the meantime came before this.
+    // All messages of the meantime came before this message.
     watcher.send(GatewayMessage::PublishStatus {
         status: watcher.status.clone(),
     });
@@ -108,7 +108,7 @@ async fn living_namesakes_are_reported() {
     let restarted = Node::follower("riemann", &address).await;
     restarted.stop().await;
     let restarted = Node::follower("riemann", &address).await;
-    until("it hears itself", || {
+    until("the node receives its own message", || {
         restarted.counters.events(Event::Echo) > 0
     })
     .await;

@@ -21,7 +21,7 @@ pub(crate) const ORIGIN: GeographicOrigin = GeographicOrigin {
     rotation_deg: 0.0,
 };
 
-/// An edge on loopback alone that leads a cell without known locations.
+/// An edge on loopback alone that leads a cell without landmarks.
 pub(crate) fn config(cell: &'static str, broker: BrokerAddress) -> NodeConfig {
     let mut config = NodeConfig {
         origin: Some(ORIGIN),

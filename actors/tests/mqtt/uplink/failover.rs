@@ -95,7 +95,7 @@ async fn new_leader_continues_uplink() {
         };
         let leads = |names: &[&str]| last_of().is_some_and(|last| names.contains(&last.as_str()));
         until("the edge's maps in the region", async || leads(&["edge"])).await;
-        // Time to be told who stands by, and to connect to it.
+        // Time until the node has the name of the standby and a connection to it.
         tokio::time::sleep(Duration::from_secs(3)).await;
         let at_kill = maps().len() - 1;
         drop(edge);
@@ -127,7 +127,7 @@ async fn new_leader_continues_uplink() {
         let before = maps().len();
         until("the edge's maps again", async || leads(&["edge"])).await;
         until("the edge's status", async || has_status(&["edge"])).await;
-        // One that has lost the lead and went on would be among the last four again and again.
+        // A former leader that continued to publish would repeatedly be among the last four.
         let of_edge = |message: &CellMap| message.map.aggregator.as_str() == "edge";
         let is_alone = || {
             subscriber

@@ -1,4 +1,4 @@
-//! Two cells beside each other.
+//! Two neighbouring cells.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -99,7 +99,7 @@ async fn neighbours_nearby_objects_are_mapped() {
         let hz = (subscriber.maps("south").len() - begun) as f64
             / clock::now().since(since).as_secs_f64();
         eprintln!(
-            "{}: {hz:.1} maps a second beside a neighbour, age there {:.0} ms",
+            "{}: {hz:.1} maps a second with a neighbour, age there {:.0} ms",
             broker.name(),
             1e3 * near.age_s
         );
@@ -117,7 +117,7 @@ async fn neighbours_nearby_objects_are_mapped() {
         );
         assert!(north.counters().events(Event::CellMapAccepted) > 10);
 
-        // Strangers are counted by cell, and change nothing.
+        // Unknown cells are counted by cell, without an effect.
         let tile = Quadkey::of_cell(&ORIGIN);
         let kind = RegionTopicKind::Map;
         let of = |cell| RegionTopic {

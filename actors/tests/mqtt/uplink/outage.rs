@@ -12,7 +12,7 @@ use crate::mosquitto::Mosquitto;
 use crate::uplink::cell::{config, round, start, trouble, until};
 use crate::uplink::region::{Broker, Subscriber, assert_in_order};
 
-/// Without its region the cell goes on as before and says what is wrong; nothing waits for the region's return.
+/// Without its region the cell continues as before and reports the trouble; no part waits for the region's return.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn cell_survives_region_outage() {
     for mut broker in Broker::both() {
@@ -84,7 +84,7 @@ async fn cell_survives_region_outage() {
     }
 }
 
-/// A broker that hangs gets few maps, and what it passes on afterwards is too old for anybody.
+/// A broker that hangs receives few maps, and the maps that it forwards afterwards are too old for all receivers.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn delayed_maps_are_dropped() {
     let broker = Mosquitto::start();
@@ -180,7 +180,7 @@ async fn killed_uplink_is_restarted() {
         subscriber.maps("north").len() >= heard + 4
     })
     .await;
-    // The new one does not know which map was the last.
+    // The new leader does not have the number of the last map.
     let mut maps = subscriber.maps("north");
     maps.dedup_by_key(|(message, _)| message.map.round);
     assert_in_order(&maps);

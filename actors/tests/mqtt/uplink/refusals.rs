@@ -15,7 +15,7 @@ use crate::mosquitto::Mosquitto;
 use crate::uplink::cell::{config, round, start, trouble, until};
 use crate::uplink::region::{Broker, Subscriber};
 
-/// A wrong password is told as such, with the broker's address, and costs the cell nothing.
+/// A wrong password is reported as such, with the broker's address, and does not affect the cell.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn wrong_credentials_are_reported() {
     for broker in Broker::both_with_user("north", "correct horse") {
@@ -46,7 +46,7 @@ async fn wrong_credentials_are_reported() {
 
         let node = start(right).await;
         // The own maps and status.
-        until("what it tells comes back", async || {
+        until("its own message comes back", async || {
             node.counters().events(Event::RegionReceived) > 3
         })
         .await;
@@ -55,7 +55,7 @@ async fn wrong_credentials_are_reported() {
     }
 }
 
-/// A broker that acknowledges what it does not permit is found out: the own status does not come back.
+/// A broker that acknowledges forbidden subscriptions is detected, because the own status does not come back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn missing_permissions_are_told() {
     let broker = Mosquitto::with_permissions("north", "correct horse", "topic read ecod/v1/geo/#");
@@ -75,7 +75,7 @@ async fn missing_permissions_are_told() {
     node.stop().await;
 }
 
-/// A cell without a place on Earth says so and tells the region nothing; with a place it begins.
+/// A cell without a position on Earth reports this and publishes no maps to the region; with a position it starts.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn missing_origin_is_reported() {
     let broker = Mosquitto::start();
@@ -132,7 +132,8 @@ async fn missing_origin_is_reported() {
     node.stop().await;
 }
 
-/// A broker that asks for certificates takes the node's own; one with another certificate than `ca` says is refused.
+/// A broker that requests certificates accepts the node's certificate; a broker whose certificate is not from `ca` is
+/// refused.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn both_certificates_are_checked() {
     let directory = tempfile::tempdir().unwrap();
@@ -185,7 +186,7 @@ async fn both_certificates_are_checked() {
 
     config.uplink.ca = Some(region.0);
     let node = start(config).await;
-    until("what it tells comes back", async || {
+    until("its own message comes back", async || {
         node.counters().events(Event::RegionReceived) > 3
     })
     .await;

@@ -1,4 +1,4 @@
-//! A region: a broker, and a subscriber to all that cells tell there.
+//! A region: a broker, and a subscriber to all messages that cells publish there.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -114,7 +114,7 @@ impl Subscriber {
                     Ok(Event::Incoming(Incoming::Publish(publish)))
                         if !publish.payload.is_empty() =>
                     {
-                        // Junk of a test's own is none of a cell's.
+                        // Junk that a test publishes itself does not count as a message of a cell.
                         let Some(topic) = RegionTopic::parse(&publish.topic) else {
                             continue;
                         };

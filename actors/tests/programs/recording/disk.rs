@@ -1,4 +1,4 @@
-//! Processes that are killed, and disks that take nothing.
+//! Processes that are killed, and disks that refuse writes.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -18,7 +18,7 @@ use crate::recording::cell::{Log, config};
 pub(crate) struct Process(pub(crate) Child);
 
 impl Process {
-    /// Asks the process to end, and waits for it.
+    /// Sends the process a termination signal, and waits for its end.
     pub(crate) fn terminate(&mut self) {
         kill(Pid::from_raw(self.0.id() as i32), Signal::SIGTERM).unwrap();
         assert!(self.0.wait().unwrap().success());
@@ -37,7 +37,7 @@ pub(crate) fn edge(directory: &Path, prelude: &str) -> Process {
     node_of(Role::Edge, directory, prelude)
 }
 
-/// The same in another role; its name is `edge` all the same.
+/// The same node in another role; its name is still `edge`.
 pub(crate) fn node_of(role: Role, directory: &Path, prelude: &str) -> Process {
     let file = directory.join("edge.toml");
     let config = config("edge", role, directory);
@@ -75,7 +75,7 @@ pub(crate) fn maps(directory: &Path) -> usize {
     }
 }
 
-/// SIGKILL costs what was not flushed, a second at most, and the rest is read.
+/// SIGKILL costs the unflushed entries, at most a second; the remaining entries are read.
 #[test]
 fn log_survives_process_kill() {
     let directory = tempfile::tempdir().unwrap();
@@ -130,7 +130,7 @@ fn full_disk_costs_entries_only() {
         log.messages
             .iter()
             .any(|message| is(&message, "\"continue\"")),
-        "the second file says where it begins"
+        "the second file states its beginning"
     );
     assert!(
         log.messages
@@ -140,8 +140,8 @@ fn full_disk_costs_entries_only() {
     );
 }
 
-/// A follower takes no reports of others unless told to, which shows in the log of the node, not only in what is
-/// missing afterwards.
+/// A follower accepts reports of others only if configured to do so. The test checks the node's log, in addition to
+/// missing results afterwards.
 #[test]
 fn follower_notes_missing_reports() {
     for (role, says_so) in [(Role::Cav, true), (Role::Auto, false)] {
@@ -161,7 +161,7 @@ fn follower_notes_missing_reports() {
     }
 }
 
-/// A map log on a full disk, or on one that cannot be written, costs no map and no start.
+/// A map log on a full or unwritable disk does not prevent maps or the start.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn unwritable_log_delays_no_map() {
     for path in ["/dev/full", "/proc/maps.jsonl"] {

@@ -15,7 +15,7 @@ fn log(version: u64) -> Vec<u8> {
     log_with(&[("log", &version.to_string())])
 }
 
-/// The same with other metadata.
+/// The same file with other metadata.
 fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let mut writer: Writer<_> = WriteOptions::new()
@@ -81,7 +81,7 @@ fn file(folder: &TempDir, name: &str, bytes: &[u8]) -> PathBuf {
     path
 }
 
-/// The code with which a replay ends, the number of lines it writes, and what it says.
+/// The exit code of a replay, the number of lines that it writes, and its messages.
 fn replay(inputs: &[&Path]) -> (i32, usize, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
     command.args(["replay", "--output", "-"]);
@@ -144,7 +144,7 @@ fn readable_log_part_is_used() {
     }
 }
 
-/// Reports that are fused in another way than they were are no replay: what cannot be known has to be said.
+/// Reports that are fused in another way than in the original run are not a replay: missing settings have to be stated.
 #[test]
 fn unreadable_configuration_requires_given_one() {
     let folder = TempDir::new().unwrap();

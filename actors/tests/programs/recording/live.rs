@@ -1,4 +1,4 @@
-//! What a viewer of Foxglove's protocol is told by a recording node.
+//! The messages of a recording node to a viewer of Foxglove's protocol.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -10,7 +10,7 @@ use ecod_actors::telemetry::counters::Event;
 
 use crate::recording::cell::config;
 
-/// Asks for the websocket and reads until all of these were said.
+/// Opens the websocket and reads until all of these texts have arrived.
 fn view(port: u16, wanted: &[&str]) {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
     stream
@@ -31,7 +31,7 @@ fn view(port: u16, wanted: &[&str]) {
     }
 }
 
-/// A viewer is told of the channels; while its port is taken by another, the node records all the same.
+/// A viewer receives the channels. If another program uses the viewer port, the node still records.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn viewers_receive_recorded_channels() {
     let directory = tempfile::tempdir().unwrap();
@@ -60,7 +60,7 @@ async fn viewers_receive_recorded_channels() {
         while !served() {
             assert!(
                 std::time::Instant::now() < deadline,
-                "the port is free and nobody serves there"
+                "the port is free without a server"
             );
             std::thread::sleep(Duration::from_millis(100));
         }

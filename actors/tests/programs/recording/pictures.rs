@@ -57,8 +57,8 @@ async fn record(directory: &Path) -> (usize, Duration) {
     )
 }
 
-/// Of a camera that is looked at ten times a second, as many as were asked for are JPEG files in the log, each with the
-/// optics and the boxes of its time.
+/// From a camera with ten frames a second, the log contains the requested number of JPEG files, each with the optics
+/// and the boxes of its time.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn requested_pictures_are_in_log() {
     let directory = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! The Python reader that everybody has agrees on what is in a log.
+//! The standard Python reader and this project read equal contents from a log.
 
 use std::path::Path;
 use std::process::Command;
@@ -63,7 +63,7 @@ fn python_reads_truncated_log() {
         }
         let theirs = maps_by(&python, &dir, state);
         let ours = Log::read(&dir).count(SchemaName::GlobalMap);
-        // Of a chunk that is cut short, this project's own reader takes what is whole.
+        // From a truncated chunk, this project's reader takes the complete entries.
         assert!(
             theirs >= 20 && theirs <= ours && (state == "killed" || theirs == ours),
             "{state}: {theirs} of {ours}"

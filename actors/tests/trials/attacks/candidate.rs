@@ -202,7 +202,8 @@ pub(crate) async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> an
     }
 }
 
-/// Shares in the names of others, signed by the attacker or not at all, and of leaderships that never were.
+/// Shares in the names of others, with the attacker's signature or without a signature, and shares of invented
+/// leaderships.
 async fn forged_evidence(target: Target) -> anyhow::Result<()> {
     let _member = join(&target, Role::Auto).await?;
     let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::clone(&target.credentials));

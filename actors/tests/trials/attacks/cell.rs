@@ -103,12 +103,12 @@ impl Victim {
     }
 }
 
-/// Knowledge and secrets of an attacker. A row uses what its means allow.
+/// Data and secrets of an attacker. A row uses the ones that its means allow.
 #[derive(Clone)]
 pub(crate) struct Target {
     /// Number of its deeds so far, in the row's unit.
     pub(crate) deeds: Arc<AtomicU64>,
-    /// The attacked broker, and that of the candidate which does not lead.
+    /// The attacked broker, and the broker of the candidate that does not lead.
     pub(crate) broker: SocketAddr,
     pub(crate) standby: SocketAddr,
     /// The leader's process.
@@ -129,7 +129,7 @@ pub(crate) struct Target {
     pub(crate) vehicles: Vec<Arc<Credentials>>,
     /// A certificate of another CA, for [`key_holder::NAME`](crate::attacks::key_holder::NAME).
     pub(crate) foreign: Arc<Credentials>,
-    /// Directory of the CA's files, `pki`, and of each node's, for whoever defends the cell.
+    /// Directory of the CA's files, `pki`, and of each node's files, for the defender of the cell.
     pub(crate) home: PathBuf,
 }
 
@@ -299,7 +299,7 @@ impl Cell {
 
     /// The beginning of a measurement.
     pub(crate) fn mark(&self) -> anyhow::Result<Timestamp> {
-        // Writing 5 sets the peak of memory back to what is used now.
+        // Writing 5 resets the peak of memory to the present use.
         for node in &self.nodes[..2] {
             fs::write(format!("/proc/{}/clear_refs", node.process.id()), "5")
                 .context("peak memory of a broker")?;
@@ -429,8 +429,8 @@ struct Landmark {
 }
 
 impl Map {
-    /// True if the cell made it of the reports of honest vehicles: the object that is there, or none. Beside the location there
-    /// may be what members report in their own names.
+    /// True if the cell made the map from the reports of honest vehicles: the landmark has the real object, or no
+    /// object. Away from the landmark there may be objects that members report in their own names.
     fn is_true(&self) -> bool {
         let [landmark] = &self.landmarks[..] else {
             return false;
@@ -551,7 +551,7 @@ fn configuration(
              [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
         );
     }
-    // Objects beside the location are tracked, so that attackers can fill the map.
+    // Objects away from the landmark are tracked, so that attackers can fill the map.
     text + LANDMARK + "\n[fusion.tracks]\nmode = \"on\"\n"
 }
 
@@ -586,7 +586,7 @@ fn unsupported_map_is_false() {
             r#""v01""#,
             r#"{"contributors":["zeno"]}"#
         ),
-        "of nobody in the cell"
+        "not of a member of the cell"
     );
     assert!(
         !serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#)

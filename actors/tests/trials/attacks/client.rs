@@ -49,7 +49,7 @@ pub(crate) async fn log_in(
     log_in_as(target, tls, &client_id).await
 }
 
-/// The same with any client id. The keep-alive is off.
+/// A connection with any client id. The keep-alive is off.
 pub(crate) async fn log_in_as(
     target: &Target,
     tls: &Arc<ClientConfig>,

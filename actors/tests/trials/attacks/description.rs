@@ -21,7 +21,7 @@ use crate::attacks::client::publish;
 /// Maximum time until all nodes have a description.
 const PATIENCE: Duration = Duration::from_secs(6);
 
-/// The attacker never stops. All nodes use the right description all the time.
+/// The attacker continues without a pause. All nodes use the right description all the time.
 pub(crate) async fn set_without_right(target: Target) -> anyhow::Result<()> {
     let file = target.home.join("right.toml");
     fs::write(&file, LANDMARK)?;
@@ -88,7 +88,7 @@ async fn used_by_all(target: &Target, hash: &str) -> anyhow::Result<()> {
     }
 }
 
-/// True if the observed vehicle has the description, and says that all nodes use it.
+/// True if the observed vehicle has the description, and reports that all nodes use it.
 fn is_used_by_all(shown: &str, hash: &str) -> bool {
     let states = |name: &str| {
         let line = shown

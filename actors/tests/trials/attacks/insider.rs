@@ -1,4 +1,4 @@
-//! An attacker that takes part in the membership, as far as it is admitted, and says anything there.
+//! An attacker that is a member, as far as it is admitted, and sends arbitrary messages there.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -100,7 +100,7 @@ impl Insider {
         }
     }
 
-    /// Knocks for ever, and is admitted by nobody.
+    /// Greets without end, and is not admitted by any node.
     pub(crate) async fn knock(&self) -> anyhow::Result<()> {
         loop {
             self.target
@@ -111,12 +111,12 @@ impl Insider {
         }
     }
 
-    /// An epoch of its own.
+    /// An invented epoch of the attacker.
     pub(crate) fn epoch(&self, term: u64) -> Epoch {
         Epoch::new(term, self.name.clone())
     }
 
-    /// Says the same to all members, ten times a second.
+    /// Sends one message to all members, ten times a second.
     pub(crate) async fn repeat(
         &self,
         term: u64,

@@ -42,7 +42,7 @@ pub(crate) const ROWS: &[Row] = &[
     },
 ];
 
-/// The name under which the attacker takes part.
+/// The member name of the attacker.
 pub(crate) const NAME: &str = "mallory";
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {

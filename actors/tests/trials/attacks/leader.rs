@@ -79,7 +79,7 @@ async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
         )
     };
     let packets: Vec<_> = shares.map(packet).collect();
-    // The leader's machine is the attacker's: the standby's broker is asked.
+    // The leader's machine belongs to the attacker, so the standby's broker is queried.
     let standby = Target {
         broker: target.standby,
         ..target.clone()

@@ -80,7 +80,7 @@ pub(crate) const ROWS: &[Row] = &[
     },
 ];
 
-/// Time after a revocation in which nodes stop to use what the node reported.
+/// Time after a revocation in which nodes stop using the node's reports.
 const GONE_WITHIN: Duration = Duration::from_secs(2);
 
 /// Objects of a report, by its number.
@@ -108,7 +108,7 @@ fn crowd(number: u64) -> Vec<PerceivedObject> {
     (0..1000).map(place).collect()
 }
 
-/// Reports in the vehicle's name and those of its parts, each at this period.
+/// Reports in the vehicle's name and in the names of its parts, each at this period.
 async fn report_for_ever(
     target: Target,
     senders: u64,

@@ -32,7 +32,7 @@ pub(crate) enum Means {
     Stranger,
     /// Holds the cell's key, and no certificate.
     CellKey,
-    /// Holds the certificate of a vehicle that never leads.
+    /// Has the certificate of a vehicle that cannot lead.
     Vehicle,
     /// Holds the certificate of a node that may lead, and does not.
     Candidate,
@@ -63,11 +63,11 @@ pub(crate) struct Bar {
     pub(crate) rss_mb: u64,
     /// Longest time without a map, in ms. Maps of that time are not expected.
     pub(crate) longest_gap_ms: Option<u64>,
-    /// True if another node leads in the end than in the beginning; none where either will do.
+    /// True if a different node leads at the end than at the beginning; `None` if both are allowed.
     pub(crate) is_replaced: Option<bool>,
 }
 
-/// The bar of attacks that may cost a cell nothing.
+/// The bar of attacks that must not affect a cell.
 pub(crate) const UNHARMED: Bar = Bar {
     maps: 0.95,
     honest: 0.95,
@@ -91,8 +91,8 @@ pub(crate) struct Outcome {
     pub(crate) longest_gap_ms: u64,
     /// True if the last map is of another node than the leader of the beginning.
     pub(crate) is_replaced: bool,
-    /// Maps that say what no honest vehicle has seen, or that no node of the cell made, and nodes that keep forged
-    /// evidence.
+    /// Maps with objects that no honest vehicle has detected, or that no node of the cell made, and nodes that keep
+    /// forged evidence.
     pub(crate) believed_lies: usize,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,

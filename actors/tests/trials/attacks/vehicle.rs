@@ -1,4 +1,4 @@
-//! The owner of a vehicle's certificate, which may report, read everything, and never lead.
+//! The owner of a vehicle's certificate, which may report and read everything, but not lead.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -32,7 +32,7 @@ pub(crate) const ROWS: &[Row] = &[
         means: Means::Vehicle,
         on_brokers: false,
         deeds: (100, "messages"),
-        // They may move the lead, and cost nobody a map.
+        // These attacks may change the leader, but must not cost a map.
         bar: Bar {
             is_replaced: None,
             ..UNHARMED
@@ -134,7 +134,7 @@ fn report() -> Vec<u8> {
     publish(&detections(VEHICLE), &vec![b'x'; 255_000])
 }
 
-/// Every connection sends as much as it can; some of them also subscribe to everything and read nothing.
+/// Every connection sends as much as possible; some connections also subscribe to everything without reading.
 async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
     let reading = [subscribe("#"), report()];
     let connection = |index| {
@@ -314,7 +314,7 @@ async fn log_in_by_websocket(target: &Target) -> anyhow::Result<TlsStream<TcpStr
     Ok(socket.into_inner())
 }
 
-/// Vehicles follow the leader, and say that its broker, or others, cannot be reached.
+/// Vehicles follow the leader, and report that its broker, or other brokers, cannot be reached.
 async fn no_login(target: Target, at: &'static [&'static str]) -> anyhow::Result<()> {
     let say = |(name, credentials): (&'static str, &Arc<Credentials>)| {
         let target = target.clone();

@@ -1,4 +1,4 @@
-//! Nodes as processes, each with a wall clock of its own.
+//! Nodes as processes, each with a separate wall clock.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -55,7 +55,7 @@ pub(crate) struct Cell {
     valid: Duration,
     /// The maps that a node with the right clock took.
     record: Record,
-    /// Readiness of each node at each look, with the true time.
+    /// Readiness of each node at each query, with the true time.
     claims: BTreeMap<String, Vec<(Timestamp, bool)>>,
     brokers: BTreeMap<&'static str, SocketAddr>,
 }
@@ -137,7 +137,7 @@ impl Cell {
         self.directory.path().join(name)
     }
 
-    /// Starts a node whose wall clock says this.
+    /// Starts a node with this wall clock.
     pub(crate) fn start(&mut self, name: &str, clock: Fake) {
         let page = free_tcp();
         let config = self.config(name, page) + &self.certificates(name);
@@ -291,8 +291,8 @@ impl Cell {
         }
     }
 
-    /// Notes new maps, and whether the nodes say that they are ready, and waits a moment. A map counts from here on, so
-    /// that all that waits looks.
+    /// Records new maps and the readiness of the nodes, and waits a moment. A map counts from its recording on, so
+    /// every waiting test calls this function.
     fn look(&mut self) {
         self.record();
         for (name, node) in &mut self.nodes {
@@ -316,16 +316,16 @@ impl Cell {
         }
         assert!(
             !readiness(self.nodes[name].page).0,
-            "{name} is ready and says {reason}"
+            "{name} is ready and reports {reason}"
         );
     }
 
-    /// A node's readiness in its own words; nothing while there is no page.
+    /// A node's readiness as it reports it; `None` while there is no page.
     pub(crate) fn readiness(&self, name: &str) -> String {
         readiness(self.nodes[name].page).1
     }
 
-    /// When a node first says that it is ready; others may use it some moments before.
+    /// Time at which a node first reports that it is ready; others may use it some moments before.
     pub(crate) fn first_ready(&mut self, name: &str, since: Timestamp) -> Timestamp {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -342,7 +342,7 @@ impl Cell {
         }
     }
 
-    /// Longest time for which a node said that it is ready while no useful map came.
+    /// Longest time for which a node reported that it is ready without a useful map.
     pub(crate) fn longest_idle(
         &self,
         name: &str,
@@ -374,7 +374,7 @@ impl Cell {
     }
 }
 
-/// Readiness of a node and its reason; nothing while there is no page.
+/// Readiness of a node and its reason; `None` while there is no page.
 fn readiness(page: SocketAddr) -> (bool, String) {
     let Ok(mut stream) = TcpStream::connect(page) else {
         return (false, String::new());
@@ -414,7 +414,7 @@ impl Drop for Cell {
     }
 }
 
-/// Unix time by this machine's clock, which nobody fakes here.
+/// Unix time by this machine's clock, which is not faked here.
 pub(crate) fn true_time() -> Timestamp {
     Timestamp::default() + SystemTime::now().duration_since(UNIX_EPOCH).unwrap()
 }

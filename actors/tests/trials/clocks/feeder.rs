@@ -1,4 +1,4 @@
-//! A client without a node: it stamps its reports by its own wall clock and knows no other.
+//! A client without a node: it stamps its reports by its own wall clock only.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ pub(crate) struct Feeder {
 }
 
 impl Feeder {
-    /// Starts it; its clock is so many seconds ahead.
+    /// Starts the client; its clock is so many seconds ahead.
     pub(crate) fn start(brokers: Vec<SocketAddr>, ahead_s: Arc<AtomicI64>) -> Self {
         let runtime = Builder::new_multi_thread()
             .worker_threads(1)

@@ -1,4 +1,4 @@
-//! The maps that a node took, as its map log tells.
+//! The maps that a node accepted, by its map log.
 
 use std::path::Path;
 use std::time::Duration;

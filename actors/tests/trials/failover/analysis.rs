@@ -1,6 +1,7 @@
-//! What a trial's logs say: gaps, missed rounds, superseded maps, lasting double leaders, needless changes of leader.
+//! Analysis of a trial's logs: gaps, missed rounds, superseded maps, lasting double leaders, needless changes of
+//! leader.
 //!
-//! Everything is computed from the maps that the nodes accepted and when; nothing here touches a process or a clock.
+//! All results are computed from the accepted maps and their times; this module does not use processes or clocks.
 
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
@@ -45,7 +46,7 @@ pub(crate) struct Phase {
     pub(crate) changes: RangeInclusive<usize>,
     /// Groups of living nodes that reach each other; each has one leader at the end of the phase.
     pub(crate) components: Vec<BTreeSet<NodeName>>,
-    /// The vehicles whose longest wait for a map counts as the trial's gap; none when the phase is not measured.
+    /// The vehicles whose longest wait for a map counts as the trial's gap; empty if the phase is not measured.
     pub(crate) measured: BTreeSet<NodeName>,
 }
 
@@ -64,12 +65,12 @@ pub(crate) struct Verdict {
     pub(crate) double_leader: bool,
     /// True if the reputations after the trial differ from those before; judged by the caller.
     pub(crate) reputations_changed: bool,
-    /// New leaderships beyond those that the faults explain, and expected ones that did not come about.
+    /// New leaderships that the faults do not explain, and expected leaderships that did not occur.
     pub(crate) false_failovers: u64,
-    /// True if so much processor time was withheld from the machine that a missed bar of time tells nothing; judged by
+    /// True if so much processor time was withheld from the machine that a missed time bar is not meaningful; judged by
     /// the caller.
     pub(crate) is_void: bool,
-    /// Outcome for programs beside the measured vehicles; judged by the caller.
+    /// Outcome for programs next to the measured vehicles; judged by the caller.
     pub(crate) doors: DoorVerdict,
     /// Cost of a flood, if there was one; judged by the caller.
     pub(crate) flood: Option<FloodCost>,
@@ -243,7 +244,7 @@ mod tests {
 
     #[test]
     fn clean_failover_costs_only_gap() {
-        // The edge's last round comes at 900 ms; a takes over at 1050, b hears of it at 1060.
+        // The edge's last round comes at 900 ms; a takes over at 1050, b receives it at 1060.
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let b = run("b", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1060, 20)]);
         let verdict = judge(&[a, b], &[phase(910, 2950, 1..=1, &["a", "b"])]);

@@ -1,4 +1,4 @@
-//! A cell of real processes, one edge and its vehicles, and what a trial does to it.
+//! A cell of real processes, one edge and its vehicles, and the faults that a trial causes.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -49,11 +49,11 @@ pub(crate) struct Plan {
     pub(crate) edge: bool,
     /// True if all use mosquitto.
     pub(crate) external_broker: bool,
-    /// True if the brokers of the nodes are used beside it.
+    /// True if programs use the brokers of the nodes.
     pub(crate) fallback: bool,
     /// True if every node has a network namespace.
     pub(crate) bridged: bool,
-    /// True if the vehicles vote on what they see.
+    /// True if the vehicles vote on their detections.
     pub(crate) votes: bool,
 }
 
@@ -161,7 +161,7 @@ impl Cell {
         self.settle_within(START_TIMEOUT).await
     }
 
-    /// The same, for no longer than this.
+    /// Waits like [`Self::settle`], for at most this time.
     pub(crate) async fn settle_within(&mut self, limit: Duration) -> anyhow::Result<()> {
         let started = Instant::now();
         let mut well_since: Option<Instant> = None;
@@ -193,7 +193,7 @@ impl Cell {
             while logs::at_door(&node.door_log())?.is_empty() {
                 ensure!(
                     started.elapsed() < START_TIMEOUT,
-                    "the client beside {} gets no map",
+                    "the client at {} receives no map",
                     node.name
                 );
                 tokio::time::sleep(Duration::from_millis(50)).await;
@@ -275,7 +275,7 @@ impl Cell {
             .kill()
     }
 
-    /// Starts so many processes that do nothing but compute, or ends them.
+    /// Starts or ends so many processes that only compute.
     pub(crate) fn busy(&mut self, loops: usize) -> anyhow::Result<()> {
         self.busy.clear();
         let shell = Path::new("/bin/sh");
@@ -356,7 +356,7 @@ impl Cell {
         self.bridged()?.lose(percent)
     }
 
-    /// Whoever leads, by what its own log says last.
+    /// The leader, by the last entry of its own log.
     pub(crate) fn leader(&self) -> anyhow::Result<usize> {
         let newest = self.newest()?.context("there are no maps")?;
         self.index(&newest.epoch.leader)
@@ -384,7 +384,7 @@ impl Cell {
         Ok(())
     }
 
-    /// Groups of nodes that run and reach each other; none while packets are lost at random.
+    /// Groups of nodes that run and reach each other; empty while packets are lost at random.
     pub(crate) fn components(&self) -> Vec<BTreeSet<NodeName>> {
         let runs = |index: &usize| {
             let node = &self.nodes[*index];
@@ -406,7 +406,7 @@ impl Cell {
             .collect()
     }
 
-    /// The vehicles that run; the edge serves them but is none.
+    /// The running vehicles, without the edge that serves them.
     pub(crate) fn vehicles(&self) -> BTreeSet<NodeName> {
         let vehicles = self
             .nodes
@@ -462,7 +462,7 @@ impl Cell {
         runs.map(read).collect()
     }
 
-    /// Leaves configurations and logs where they are, and says where.
+    /// Keeps configurations and logs, and prints their directory.
     pub(crate) fn keep_files(self) -> PathBuf {
         let Self { directory, .. } = self;
         directory.keep()
@@ -537,6 +537,6 @@ impl Node {
 
     fn last_words(&self) -> String {
         let text = fs::read_to_string(self.log()).unwrap_or_default();
-        text.lines().last().unwrap_or("nothing logged").to_owned()
+        text.lines().last().unwrap_or("no log").to_owned()
     }
 }

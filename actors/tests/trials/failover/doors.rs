@@ -1,4 +1,4 @@
-//! A plain MQTT client at each node's broker, and its maps against those that the node accepted.
+//! A plain MQTT client at each node's broker, and a comparison of its maps with the maps that the node accepted.
 
 use std::collections::{BTreeSet, HashMap};
 use std::fs::File;
@@ -15,18 +15,18 @@ use crate::failover::analysis::{Accepted, NodeRun, Phase, longest_wait, served, 
 use crate::failover::settings::CELL;
 use crate::process::{Process, command};
 
-/// Knows nothing of ECOD: it prints what it gets, and when.
+/// A client without ECOD's code: it prints every message with its time.
 const CLIENT: &str = "/usr/bin/mosquitto_sub";
 
-/// Service of the programs beside measured vehicles.
+/// Service of the programs next to measured vehicles.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct DoorVerdict {
-    /// The most by which the longest wait for a map at a door exceeds that at its node.
+    /// Maximum difference between the longest wait for a map at a door and at its node.
     pub(crate) longer_gap: Option<Duration>,
     /// For each map, how much later the program had it than the node, in microseconds. Negative where the cell's time,
     /// by which the node dates, is ahead of the machine's clock.
     pub(crate) delays: Vec<i64>,
-    /// Maps that a program got twice, out of order or not at all, and maps that its node never accepted.
+    /// Maps that a program missed or received twice or out of order, and maps that its node did not accept.
     pub(crate) wrong: u64,
     /// Ends of phases at which a program was without maps.
     pub(crate) unserved: u64,
@@ -222,7 +222,7 @@ mod tests {
             1,
             "refused by the node"
         );
-        assert_eq!(judge(&node, run([])).wrong, 1, "nothing at all");
+        assert_eq!(judge(&node, run([])).wrong, 1, "no maps");
     }
 
     #[test]

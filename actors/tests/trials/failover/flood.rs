@@ -62,7 +62,7 @@ enum Misuse {
     Foreign(NodeName),
     /// A connection and its end.
     Connections,
-    /// Nothing, after it has subscribed to everything; it never reads.
+    /// Subscribes to everything, then sends no messages and does not read.
     NeverReads,
 }
 

@@ -1,4 +1,4 @@
-//! Reads what the nodes wrote.
+//! Reads the logs of the nodes.
 
 use std::fs::{self, File};
 use std::io::{self, Read, Seek, SeekFrom};
@@ -34,12 +34,12 @@ struct Landmark {
     contributors: Vec<NodeName>,
 }
 
-/// All maps of a log; a line that a killed process left unfinished is none.
+/// All maps of a log, without a line that a killed process left unfinished.
 pub(crate) fn accepted(path: &Path) -> anyhow::Result<Vec<Accepted>> {
     maps(path, parse)
 }
 
-/// Number of maps in a log, from a time on, to which a node contributes nothing.
+/// Number of maps in a log, from a time on, without a contribution of a node.
 pub(crate) fn without(path: &Path, node: &NodeName, since: Timestamp) -> anyhow::Result<u64> {
     let lacks = |map: &Map| {
         map.landmarks
@@ -99,7 +99,7 @@ pub(crate) fn last_accepted(path: &Path) -> anyhow::Result<Option<Accepted>> {
     Ok(parse(line).ok())
 }
 
-/// Whom a node's log names as its standby, as of its last word on who leads.
+/// The standby in a node's log, by its last entry about the leader.
 pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
     let text = fs::read_to_string(log).with_context(|| format!("cannot read {}", log.display()))?;
     let last = text.lines().rfind(|line| line.contains("position=leading"));

@@ -18,7 +18,7 @@ const MICROS: u128 = 1_000_000;
 pub(crate) struct Outcome {
     scenario: &'static str,
     nodes: usize,
-    /// Those that count.
+    /// The valid trials.
     trials: usize,
     void: usize,
     gap_ms: Gaps,
@@ -44,16 +44,16 @@ struct Gaps {
     max: Option<u64>,
 }
 
-/// Outcome for programs beside the vehicles.
+/// Outcome for programs next to the vehicles.
 #[derive(Debug, Serialize)]
 struct Doors {
-    /// By how much the gap of a program exceeds that of its node, over the trials.
+    /// Difference between the gap of a program and the gap of its node, over the trials.
     longer_gap_us: Gaps,
     /// By how much a program has a map later than its node.
     delay_us: Gaps,
     /// Maps whose delays these are.
     maps: u64,
-    /// Those of them that a program seems to have before its node, whose clock is ahead.
+    /// Number of maps that a program seems to receive before its node, whose clock is ahead.
     early_maps: u64,
     wrong_maps: u64,
     /// Programs that were without maps at the end of a phase.
@@ -142,8 +142,8 @@ impl Doors {
         }
     }
 
-    /// The bars that were missed. Those for times are for the median, and not for a crowded machine; of a few trials the
-    /// median tells nothing about their longest waits.
+    /// The missed bars. Time bars apply to the median, and not on a crowded machine; with few trials the median does
+    /// not show their longest waits.
     fn misses(&self, trials: usize) -> impl Iterator<Item = String> {
         let over = |what: &str, gaps: &Gaps, bar: Duration| {
             let bar = bar.as_micros() as u64;
@@ -182,7 +182,7 @@ impl Doors {
 }
 
 impl Outcome {
-    /// Summary of the verdicts: of void ones only what no want of processor time excuses.
+    /// Summary of the verdicts. From void trials it contains only faults that a lack of processor time does not excuse.
     pub(crate) fn new(scenario: &Scenario, nodes: usize, all: &[Verdict]) -> Self {
         let verdicts: Vec<&Verdict> = all.iter().filter(|verdict| !verdict.is_void).collect();
         Self {
@@ -305,7 +305,7 @@ pub(crate) fn table(outcomes: &[Outcome]) -> String {
             or the harness woke more than 100 ms too late\n"
 }
 
-/// The same trials as programs beside the vehicles see them.
+/// The same trials for the programs next to the vehicles.
 fn doors_table(outcomes: &[Outcome]) -> String {
     let mut text = format!(
         "\n{:<29}{:>6}{:>12}{:>9}{:>12}{:>9}{:>9}{:>7}{:>7}{:>9}\n",
@@ -490,7 +490,7 @@ mod tests {
         assert!(!misses(&[void.clone(), right.clone(), slow]).is_empty());
         assert!(
             !misses(std::slice::from_ref(&void)).is_empty(),
-            "nothing was measured"
+            "no measurement"
         );
         let superseded = Verdict {
             stale_accepted: 1,

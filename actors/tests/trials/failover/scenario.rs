@@ -1,4 +1,4 @@
-//! What happens in each scenario, and what it may cost.
+//! The faults of each scenario, and their bars.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ pub(crate) enum Cure {
     Loss,
 }
 
-/// A node by what it does at the moment.
+/// A node, selected by its present role.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Who {
     Edge,
@@ -52,11 +52,11 @@ pub(crate) struct Step {
     pub(crate) watch: Duration,
     /// Fewest and most new leaderships that follow.
     pub(crate) changes: (usize, usize),
-    /// True if gap and missed rounds are those of the trial.
+    /// True if gap and missed rounds count for the trial.
     pub(crate) measured: bool,
 }
 
-/// Needs of a scenario beside loopback.
+/// Requirements of a scenario in addition to loopback.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Needs {
     Loopback,
@@ -72,11 +72,11 @@ pub(crate) enum Needs {
 /// Bar of the gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum GapBar {
-    /// Nothing is asked of it.
+    /// The phase has no bar.
     None,
     /// The process is gone and its port refuses.
     Killed,
-    /// Nothing is heard any more.
+    /// The node does not receive messages any more.
     Silent,
 }
 
@@ -90,7 +90,7 @@ pub(crate) struct Scenario {
     pub(crate) edge: bool,
     pub(crate) script: &'static [Step],
     pub(crate) gap: GapBar,
-    /// True if vehicles vote beforehand, and what is known of them must not change.
+    /// True if vehicles vote beforehand, and their reputations must not change.
     pub(crate) votes: bool,
     /// True if no measured vehicle may miss a round or get one twice.
     pub(crate) seamless: bool,

@@ -15,7 +15,7 @@ pub(crate) struct Addresses {
     pub(crate) gossip: SocketAddr,
 }
 
-/// Addresses of a node: free ports on loopback, or fixed ones in a namespace.
+/// Addresses of a node: free ports on loopback, or fixed ports in a namespace.
 pub(crate) fn addresses(
     ports: &mut Ports,
     node: usize,
@@ -35,7 +35,7 @@ pub(crate) fn addresses(
 /// The cell's name.
 pub(crate) const CELL: &str = "trial";
 
-/// The cell's only known location.
+/// The only landmark of the cell.
 pub(crate) const LANDMARK: &str = "ahead";
 
 /// One object ahead of the vehicle in every frame.
@@ -49,7 +49,7 @@ pub(crate) fn frame() -> Vec<u8> {
     ppm
 }
 
-/// On loopback the nodes find each other by seeds; where each has a network interface of its own, by multicast.
+/// On loopback the nodes find each other by seeds; with a network interface for each node, by multicast.
 pub(crate) fn configuration(
     plan: &Plan,
     index: usize,

@@ -1,5 +1,5 @@
-//! Everything at once, for as long as wanted: each minute something seeded goes wrong, and all must be well again
-//! before the minute is over, with nothing growing.
+//! All faults together, for any time: each minute causes a fault from the seed, the cell must work again before the
+//! minute ends, and memory and files must not grow.
 //!
 //! `make soak` runs it: `MINUTES=n` (default 30), `NODES=n` (default 32) and `SEED=n` (default 1). The summary is printed
 //! and written to `target/soak.json`; the files of a soak that went wrong are kept.
@@ -33,7 +33,7 @@ const MINUTE: Duration = Duration::from_secs(60);
 const MAX_AGE: Duration = Duration::from_secs(1);
 
 #[test]
-#[ignore = "takes as many minutes as it is told to: make soak"]
+#[ignore = "takes the given number of minutes: make soak"]
 fn soak() {
     end_with_the_harness(run());
 }
@@ -62,7 +62,7 @@ struct Minute {
     disturbance: String,
     /// Longest time that a vehicle that ran throughout waited for a map.
     longest_gap_ms: u64,
-    /// From the end of the disturbance until all followed one leader again; none if they did not.
+    /// Time from the end of the disturbance until all followed one leader again; `None` if they did not.
     recovered_after_ms: Option<u64>,
     leader: String,
     /// The largest of all processes at the minute's end.
@@ -188,7 +188,8 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     })
 }
 
-/// Removes the maps of aggregators that are no nodes of the cell, beside whose epochs right ones would seem superseded.
+/// Removes the maps of aggregators that are not nodes of the cell, whose epochs would make correct maps appear
+/// superseded.
 fn take_out_forged(runs: &mut [NodeRun]) -> usize {
     let nodes: BTreeSet<_> = runs.iter().map(|run| run.node.clone()).collect();
     let all = |runs: &[NodeRun]| runs.iter().map(|run| run.accepted.len()).sum::<usize>();

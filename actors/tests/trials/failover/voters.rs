@@ -24,7 +24,7 @@ const VOTES: [(&str, &str); 3] = [("euclid", "cup"), ("gauss", "cup"), ("liar", 
 const VOTING: Duration = Duration::from_secs(4);
 const VOTE_PERIOD: Duration = Duration::from_millis(100);
 
-/// Longer than it takes to settle the last votes, publish what came of them, and tell the other candidates.
+/// Longer than the time to settle the last votes, publish their evidence, and send it to the other candidates.
 const SETTLING: Duration = Duration::from_secs(4);
 
 /// Longest time for the votes to settle on a busy machine.

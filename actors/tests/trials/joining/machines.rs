@@ -1,4 +1,4 @@
-//! The README's commands on three machines: network namespaces with an `/etc` and a `/var/lib` of their own.
+//! The README's commands on three machines: network namespaces, each with a separate `/etc` and `/var/lib`.
 
 use std::fs::{self, File};
 use std::os::unix::fs::PermissionsExt;
@@ -113,7 +113,7 @@ impl Machine {
         said(&output)
     }
 
-    /// Starts the node by the command that `init` or `join` told.
+    /// Starts the node by the command that `init` or `join` printed.
     fn start(&self, told: &str) -> Running {
         let line = told
             .split_once("start it: ")
@@ -186,7 +186,7 @@ fn commands() -> [String; 3] {
 #[ignore = "needs root for network namespaces: make joining"]
 fn readme_commands_form_cell() {
     let _network = Bridged::new(3).unwrap();
-    // The first is without the package, and told how to start its node.
+    // The first machine has no package, and prints how to start its node.
     let machines @ [edge, gauss, euclid] = &[
         Machine::new(0),
         Machine::with_service(1),

@@ -29,13 +29,13 @@ Boxes = Iterable[Union[PixelBox, Mapping[str, Any]]]
 AnyPose = Union[Pose, tuple[float, float, float]]
 Time = Union[datetime, float]
 
-# Brokers of a cell are known by this name at every address, and doors of nodes by the other; their certificates bear it.
+# Names in the certificates of a cell's brokers and of nodes' doors, at every address.
 BROKER_NAME, DOOR_NAME = "broker.ecod.internal", "door.ecod.internal"
 
 # Largest report by default: `mqtt.max_payload_bytes` of nodes.
 MAX_REPORT_BYTES = 256 * 1024
 
-# Silence in seconds after which the log says where to look.
+# Silence in seconds after which the log names possible causes.
 SILENCE_S = 10.0
 
 
@@ -90,8 +90,8 @@ class Cell:
             raise Invalid("cert and key need `ca`, the file with the certificates that a broker must show")
         tls = tls_context(ca, cert, key, broker_name or address[0]) if ca else None
         login = (user or env("ECOD_MQTT__USER"), password or env("ECOD_MQTT__PASSWORD"))
-        # With certificates a cell's broker takes ids of this form only, by which nobody ends another's session. Without,
-        # it takes them for nodes'.
+        # With certificates a cell's broker accepts only ids of this form, so that clients cannot end each other's sessions.
+        # Without certificates, the broker would treat such ids as ids of nodes.
         client_id = f"{self.name}-{uuid.uuid4().hex[: 32 if tls else 16]}"
         self._connection = Connection(address, client_id, tls, login, self._take, timeout)
 

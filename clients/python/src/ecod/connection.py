@@ -40,7 +40,7 @@ MAX_WAITING = 16
 # client id, password, authorisation, banned, method.
 FINAL = frozenset({0x81, 0x82, 0x84, 0x85, 0x86, 0x87, 0x8A, 0x8C})
 
-# Reason code of MQTT 5 by which a broker states that nobody receives a message.
+# Reason code of MQTT 5 by which a broker states that a message has no receiver.
 NO_SUBSCRIBERS = 0x10
 
 # Remedy for a program without TLS.
@@ -69,7 +69,7 @@ class Connection:
         self._refusal: Optional[Refused] = None
         self._filters: set[str] = set()
         self._waiting: deque[mqtt.MQTTMessageInfo] = deque()
-        # Topics and filters that the broker was asked for on this connection, by message id, and its answers that are no.
+        # Topics and filters that were requested from the broker on this connection, by message id, and its refusals.
         self._asked: dict[int, str] = {}
         self._denied: dict[int, str] = {}
         self._client = client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id, protocol=mqtt.MQTTv5)
@@ -104,7 +104,7 @@ class Connection:
             self._waiting.popleft()
         if not self.is_connected or len(self._waiting) >= MAX_WAITING:
             return False
-        # The first message asks for an answer: nothing else says that the broker does not allow them.
+        # The first message requests an answer, because only an answer shows that the broker does not allow the topic.
         is_question = topic not in list(self._asked.values())
         info = self._client.publish(topic, payload, qos=1 if is_question else 0)
         if is_question:
@@ -167,7 +167,7 @@ class Connection:
         wait = RETRY_MIN_S
         while not self.closing.is_set():
             if self._carry():
-                # A broker that lets the program in only to end the connection is not asked more and more often.
+                # If the broker admits the program only to end the connection, the retry interval is not shortened.
                 if self.is_connected and time.monotonic() - self._connected_at > RETRY_MAX_S:
                     wait = RETRY_MIN_S
             elif not self.closing.wait(wait * random.uniform(0.5, 1.0)):

@@ -190,9 +190,9 @@ class ObjectReport:
     pose: Optional[Pose] = None
     seen: Optional[Annotated[list[Label], _at_most(1024)]] = None
     view: Optional[FieldOfView] = None
-    # How wrong the stamp may be, of a node that knows the cell's time. Programs leave it out.
+    # Maximum error of the stamp, from a node with the cell's time. Programs leave it out.
     clock_error_us: Optional[Count] = None
-    # Of a frame that turns, counter-clockwise, as one that is fixed to a vehicle does.
+    # Counter-clockwise rate of a turning frame, such as a frame that is fixed to a vehicle.
     frame_yaw_rate_radps: Optional[YawRate] = None
     moving: Optional[bool] = None
 

@@ -13,7 +13,7 @@ M = TypeVar("M")
 # Silence in seconds after which a round is taken that is older than the last: the cell has begun anew.
 FORGET_S = 3.0
 
-# Nodes whose statuses are kept; beyond that the one that was heard longest ago gives way.
+# Nodes whose statuses are kept; a further node replaces the node with the oldest status.
 MAX_NODES = 1024
 
 

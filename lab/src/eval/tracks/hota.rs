@@ -112,7 +112,7 @@ impl Lives {
         lives
     }
 
-    /// Of the frames in which either is, the share in which both are together.
+    /// Frames with both identities, divided by frames with at least one of them.
     fn overlap(&self, ids: (u32, u32)) -> f64 {
         self.jaccard(ids, self.shared.get(&ids).copied().unwrap_or(0.0))
     }

@@ -1,4 +1,4 @@
-//! Generated label sets: annotators of known habits label items of known classes.
+//! Generated label sets: annotators with given habits label items with given classes.
 
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{RngExt, SeedableRng};
@@ -29,7 +29,7 @@ pub(crate) enum Habit {
     Copying,
     /// Each class is easier for some than for others.
     Partial,
-    /// A third of the items is hard for everybody.
+    /// A third of the items is hard for all annotators.
     HardItems,
     /// All of these at once, but fewer of each.
     Mixed,
@@ -89,7 +89,7 @@ pub(crate) struct Item {
 /// The kind of the set of this number.
 pub(crate) fn kind(number: u64) -> Kind {
     let mut rng = ChaCha8Rng::seed_from_u64(number);
-    // Every balance meets every habit.
+    // Every balance is combined with every habit.
     let balance = BALANCES[number as usize % BALANCES.len()];
     let habit = HABITS[number as usize / BALANCES.len() % HABITS.len()];
     let coverages = [

@@ -102,7 +102,7 @@ pub(super) struct Head {
 pub(super) enum NoHead {
     /// They fit no family, or another than the configured one.
     UnknownOutputs,
-    /// They list numbers of classes, but neither their names nor the configuration state whether
+    /// They list numbers of classes, but their names and the configuration do not state whether
     /// the numbers begin with 0 or, after a background, with 1.
     UnknownFirstClass,
 }

@@ -38,12 +38,12 @@ pub(super) struct Network {
 }
 
 impl Network {
-    /// Loads a file. `told` is the configured size of the input.
+    /// Loads a file. `configured` is the configured size of the input.
     ///
     /// # Errors
-    /// Returns an [`OnnxError`] if the file cannot be read or run, or takes something other than an
-    /// image, or another size.
-    pub(super) fn load(path: &Path, told: Option<ImageSize>) -> Result<Self, OnnxError> {
+    /// Returns an [`OnnxError`] if the file cannot be read or run, if its input is not one image, or
+    /// if the input's size differs from the configured size.
+    pub(super) fn load(path: &Path, configured: Option<ImageSize>) -> Result<Self, OnnxError> {
         bounded_file::open(path).map_err(|source| OnnxError::Unreadable {
             path: path.to_owned(),
             source,
@@ -89,7 +89,7 @@ impl Network {
             width
                 .zip(height)
                 .map(|(width, height)| ImageSize { width, height }),
-            told,
+            configured,
         ) {
             (Some(taken), Some(told)) if taken != told => {
                 return Err(OnnxError::OtherSize {

@@ -25,7 +25,7 @@ fn config(model: &str) -> OnnxConfig {
     .unwrap()
 }
 
-/// The configuration, with labels if the model has none.
+/// The configuration, with labels for a model without names.
 fn labelled(model: &str) -> OnnxConfig {
     let has_names = ["yolov5", "yolov8", "rtdetr_rows"]
         .iter()

@@ -188,7 +188,7 @@ impl PeerTable {
             .retain(|known, peer| peer.id.name != *name || keep(known));
     }
 
-    /// Ends the session of an earlier run of a node; returns false if there is none.
+    /// Ends the session of an earlier run of a node; returns false without such a session.
     pub(super) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
         let Some(peer) = self.speaker_mut(name).filter(|peer| peer.id.run != run) else {
             return false;

@@ -371,12 +371,12 @@ fn other_key_and_typo_reported() {
         heard("lot-1", ("lot-1", "08"), false),
         [(
             TroubleKind::WrongKey,
-            "heard cell lot-1 with another key, or none, from 10.0.0.7".into()
+            "received a datagram of cell lot-1 with another key or none from 10.0.0.7".into()
         )]
     );
     let misspelt = [(
         TroubleKind::OtherCell,
-        "heard cell ux-lott from 10.0.0.7, this is ux-lot".into(),
+        "received a datagram of cell ux-lott from 10.0.0.7; this node is in ux-lot".into(),
     )];
     assert_eq!(heard("ux-lot", ("ux-lott", "07"), false), misspelt);
     assert_eq!(heard("lot-1", ("lot-2", "07"), false), [], "a neighbour");

@@ -73,7 +73,7 @@ impl Issuers {
         })
     }
 
-    /// True if a certificate may give rights: a city's certificates never do, because a city
+    /// True if a certificate may give rights: a city's certificates do not, because a city
     /// certifies only vehicles.
     pub(super) fn give_rights(&self, certificate: &[u8]) -> bool {
         self.of_city.is_none()

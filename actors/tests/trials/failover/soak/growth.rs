@@ -15,7 +15,7 @@ pub(super) struct Resources {
 }
 
 impl Resources {
-    /// Reads those of a process from `/proc`.
+    /// Reads the figures of a process from `/proc`.
     pub(super) fn of(process: u32) -> anyhow::Result<Self> {
         let status = fs::read_to_string(format!("/proc/{process}/status"))?;
         let field = |name: &str| {
@@ -59,7 +59,7 @@ pub(super) struct Series(Vec<Resources>);
 /// Fewer minutes than this show no growth: a process that comes to lead for the first time takes what that takes.
 const LEAST_MINUTES: usize = 9;
 
-/// Allowed growth from the middle third of a life to its last, beside a tenth.
+/// Allowed growth from the middle third of a life to the last third, in addition to a tenth.
 const ALLOWED: Resources = Resources {
     resident_kib: 2048,
     descriptors: 8,

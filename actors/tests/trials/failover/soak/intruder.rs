@@ -1,4 +1,4 @@
-//! One that has the cell's network but not its manners: floods with reports, and sends what is none.
+//! An intruder on the cell's network: it floods the cell with reports and malformed messages.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
@@ -26,7 +26,7 @@ const FLOOD_BURST: u64 = 50;
 
 const JUNK_TICK: Duration = Duration::from_millis(20);
 
-/// Longest payload of junk, in bytes: above what a report may have.
+/// Longest payload of junk, in bytes: above the limit of a report.
 const LONGEST_JUNK: usize = 400_000;
 
 /// A client of every broker; its connections end with it.
@@ -76,7 +76,7 @@ impl Intruder {
         Ok(())
     }
 
-    /// Sends what is no message to brokers, sockets and gossip.
+    /// Sends malformed messages to brokers, sockets and gossip.
     pub(super) async fn send_junk(&mut self, lasts: Duration) -> anyhow::Result<()> {
         let udp = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))
             .await
@@ -118,7 +118,7 @@ impl Intruder {
         Ok(())
     }
 
-    /// Noise, a report cut short, one with impossible values, or a map of a leader that was never elected.
+    /// Noise, a truncated report, a report with impossible values, or a map of a leader that was not elected.
     fn junk(&mut self) -> anyhow::Result<Vec<u8>> {
         self.seq += 1;
         let mut whole = encode(&report(self.seq)?, Encoding::Json);
