@@ -149,11 +149,13 @@ async fn subscribe(
         }
         if !new.is_empty() {
             let filters: Vec<_> = new.into_iter().collect();
-            lock(asked).push_back(filters.clone());
-            let filters = filters
-                .into_iter()
-                .map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
-            let _ = client.subscribe_many(filters).await;
+            let subscriptions: Vec<_> = filters
+                .iter()
+                .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce))
+                .collect();
+            lock(asked).push_back(filters);
+            // The next login subscribes anew if the connection has ended.
+            let _ = client.subscribe_many(subscriptions).await;
         }
         present = wanted;
         // A connection that ended in the meantime reads no more messages.

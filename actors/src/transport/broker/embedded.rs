@@ -366,9 +366,8 @@ fn serve(
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
-            ready
-                .send(Err(BrokerError::Thread { address, source }))
-                .unwrap_or_default();
+            // The caller waits for the answer.
+            let _ = ready.send(Err(BrokerError::Thread { address, source }));
             return;
         }
     };
@@ -378,12 +377,13 @@ fn serve(
                 Ok(prepared) => prepared,
                 Err(error) => {
                     let reason = error.root_cause().to_string();
-                    return ready
-                        .send(Err(BrokerError::Bind { address, reason }))
-                        .unwrap_or_default();
+                    // The caller waits for the answer.
+                    let _ = ready.send(Err(BrokerError::Bind { address, reason }));
+                    return;
                 }
             };
-        ready.send(Ok(bound)).unwrap_or_default();
+        // The caller waits for the answer.
+        let _ = ready.send(Ok(bound));
         let admitting = async {
             match frontend {
                 Some(frontend) => frontend.run().await,

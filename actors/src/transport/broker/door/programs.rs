@@ -130,7 +130,8 @@ impl Door {
     pub(in crate::transport::broker) fn take(
         &self,
         principal: &Principal,
-        (place, topic): (TopicPlace, &str),
+        place: TopicPlace,
+        topic: &str,
         publish: &Publish,
     ) -> Result<(), DoorRefusal> {
         let Some(door) = self.0.as_deref() else {
@@ -226,7 +227,7 @@ impl Door {
             text = refusal.text,
             "program's message refused"
         );
-        let status = lock(&door.refusals).note(&setup.node, (client, topic), refusal, clock::now());
+        let status = lock(&door.refusals).note(&setup.node, client, topic, refusal, clock::now());
         if let Some(status) = status {
             let topic = setup.topics.clients(&setup.node);
             door.retain(Publication {
@@ -583,8 +584,7 @@ impl Handler for DoorHooks {
                 moved.topic = place.topic(&publish.topic).into();
                 // rmqtt calls `Permissions` for a published message, but not for a last will.
                 if let FromType::LastWill = from.typ()
-                    && let Err(refusal) =
-                        self.door.take(&principal, (place, &publish.topic), publish)
+                    && let Err(refusal) = self.door.take(&principal, place, &publish.topic, publish)
                 {
                     let client = &session.id.client_id;
                     self.door.note_refusal(client, &publish.topic, &refusal);
