@@ -201,8 +201,10 @@ async fn poll(
             Ok(Event::Incoming(Packet::SubAck(answer))) => {
                 let filters = lock(asked).pop_front().unwrap_or_default();
                 let answers = filters.into_iter().zip(answer.return_codes);
-                let refused = answers.filter(|(_, code)| *code == SubscribeReasonCode::Failure);
-                let refused: Vec<_> = refused.map(|(filter, _)| filter).collect();
+                let refused: Vec<_> = answers
+                    .filter(|(_, code)| *code == SubscribeReasonCode::Failure)
+                    .map(|(filter, _)| filter)
+                    .collect();
                 if !refused.is_empty() {
                     let trouble =
                         format!("the broker lets this user not read {}", refused.join(", "));

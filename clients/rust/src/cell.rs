@@ -561,9 +561,9 @@ fn micros(captured_at: SystemTime) -> Result<Timestamp, Error> {
 
 /// The parts of HOST:PORT; the port may be absent.
 fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error> {
-    let address = text.parse::<BrokerAddress>();
-    let address =
-        address.or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
+    let address = text
+        .parse::<BrokerAddress>()
+        .or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
     address.map_err(|error| Error::Invalid(error.to_string()))
 }
 

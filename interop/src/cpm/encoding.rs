@@ -75,10 +75,10 @@ pub fn encode_map(
                 CpmObject::now(object),
             ))
         });
-    let all = objects
+    let all: Vec<_> = objects
         .chain(at_places)
-        .filter(|(_, source)| !cell.vacancy_signs.contains(source.object.label));
-    let all: Vec<_> = all.collect();
+        .filter(|(_, source)| !cell.vacancy_signs.contains(source.object.label))
+        .collect();
     let numbers = ids.assign(&all.iter().map(|(id, _)| *id).collect::<Vec<_>>());
     let numbered = all.into_iter().map(|(id, source)| CpmObject {
         number: numbers.get(&id).copied(),

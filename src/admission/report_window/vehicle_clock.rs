@@ -144,10 +144,10 @@ impl VehicleClock {
                 (TimeBase::Cell, Some(bounds.cell_offset)),
                 (TimeBase::CellBefore, offset_before),
             ];
-            let mut scales = scales
+            let scale = scales
                 .into_iter()
-                .filter_map(|(base, offset)| Some((base, offset?)));
-            let scale = scales.find(|(_, offset)| is_age(*offset));
+                .filter_map(|(base, offset)| Some((base, offset?)))
+                .find(|(_, offset)| is_age(*offset));
             if let Some((base, offset)) = scale.filter(|_| i64::from(error) <= bounds.tolerance) {
                 return self.admit_in_cell_time(report, received_at, base, offset);
             }

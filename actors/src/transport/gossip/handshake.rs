@@ -173,8 +173,12 @@ impl Prover {
     /// A key pair for one handshake; `None` if the system provides no random numbers.
     pub(crate) fn draw_ephemeral(&self) -> Option<(EphemeralPrivateKey, [u8; 32])> {
         let private = EphemeralPrivateKey::generate(&X25519, &self.random).ok()?;
-        let public = private.compute_public_key().ok()?;
-        let public = public.as_ref().try_into().ok()?;
+        let public = private
+            .compute_public_key()
+            .ok()?
+            .as_ref()
+            .try_into()
+            .ok()?;
         Some((private, public))
     }
 
@@ -259,8 +263,8 @@ impl Prover {
             let most = self
                 .pending
                 .iter()
-                .max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)));
-            let most = most.map(|(key, _)| *key);
+                .max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)))
+                .map(|(key, _)| *key);
             most.and_then(|key| self.pending.remove(&key));
         }
     }

@@ -130,8 +130,8 @@ impl Swim {
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
         let mut updates = body;
-        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates);
-        let header = header.map_err(|_| FrameEvent::Malformed)?;
+        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates)
+            .map_err(|_| FrameEvent::Malformed)?;
         if header.src.name != *from {
             return Err(FrameEvent::NameMismatch);
         }

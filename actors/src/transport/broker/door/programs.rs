@@ -102,8 +102,10 @@ impl Door {
         if !setup.serves_nodes {
             return true;
         }
-        let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
-        let named = named.and_then(|(name, _)| NodeName::new(name).ok());
+        let named = client_id
+            .rsplit_once('-')
+            .filter(|(_, run)| is_run(run))
+            .and_then(|(name, _)| NodeName::new(name).ok());
         let is_own = |name: &NodeName| name.vehicle() == setup.node && !(setup.is_member)(name);
         match &principal.identity {
             Some(identity) if identity.name() != &setup.node => false,
@@ -550,9 +552,10 @@ impl DoorHooks {
     /// left is identified by the client id with which it had logged in, because its last will is
     /// still to come.
     fn program(&self, session: &Session) -> Option<Principal> {
-        let principal = self.principals.principal(session.id.remote_addr);
-        let principal =
-            principal.unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
+        let principal = self
+            .principals
+            .principal(session.id.remote_addr)
+            .unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
         self.door
             .is_program(&principal, &session.id.client_id)
             .then_some(principal)
