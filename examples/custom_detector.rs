@@ -97,8 +97,8 @@ async fn main() -> anyhow::Result<()> {
         role: Role::Edge,
         listen: Some(([127, 0, 0, 1], 0).into()),
         ..cell.clone()
-    });
-    let edge = edge.await?;
+    })
+    .await?;
 
     let camera = CameraConfig {
         name: None,

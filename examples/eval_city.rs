@@ -157,6 +157,7 @@ fn table(rows: &[(String, Vec<Figures>)]) -> String {
         let cells: Vec<String> = (0..7)
             .map(|figure| format!("{:.1}", mean(figure)))
             .collect();
+        // Writing to a text does not fail.
         let _ = writeln!(text, "| {name} | {} |", cells.join(" | "));
     }
     text

@@ -204,8 +204,8 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
         }
     }
     let path = set.join("truth.csv");
-    let truth = rows(&path, &["item", "truth"], 2).with_context(|| path.display().to_string())?;
-    let truth: BTreeMap<String, String> = truth
+    let truth: BTreeMap<String, String> = rows(&path, &["item", "truth"], 2)
+        .with_context(|| path.display().to_string())?
         .into_iter()
         .map(|row| (names.of(&row[0]), labels.of(&row[1])))
         .collect();

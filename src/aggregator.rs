@@ -337,8 +337,8 @@ impl Aggregator {
         let sender = self.windows[kind as usize].sender(&report.node, now);
         let is_nowhere = sender.misplaced >= MIN_MISPLACED;
         let place = ReportDoubt::of_ranges(report)
-            .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation));
-        let place = place.or(sender.has_moved.then_some(ReportDoubt::Moves));
+            .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation))
+            .or(sender.has_moved.then_some(ReportDoubt::Moves));
         place
             .into_iter()
             .chain(sender.is_shared.then_some(ReportDoubt::SharedName))

@@ -217,8 +217,13 @@ const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
 
-/// The subject of a trouble (`None` for the node itself) and its kind.
-type Key = (Option<String>, TroubleKind);
+/// What tells one trouble from another.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Key {
+    /// The subject; `None` for the node itself.
+    about: Option<String>,
+    kind: TroubleKind,
+}
 
 /// The current troubles of a node.
 #[derive(Debug, Clone, Default)]
@@ -274,7 +279,7 @@ impl TroubleRegister {
         let key = key(kind, about);
         let shown = |cause: &str, suffix: &str| Trouble {
             kind: kind.as_str().into(),
-            about: key.0.clone(),
+            about: key.about.clone(),
             cause: shortened(cause, MAX_TROUBLE_TEXT - suffix.len()) + suffix,
             remedy: shortened(remedy, MAX_TROUBLE_TEXT),
         };
@@ -317,7 +322,7 @@ impl TroubleRegister {
             });
         }
         if !self.make_room(&key, now) {
-            let about = key.0.unwrap_or_default();
+            let about = key.about.unwrap_or_default();
             let kind = kind.as_str();
             let cause =
                 format!("there are more troubles than have room here, such as {kind} of {about}");
@@ -348,10 +353,7 @@ impl TroubleRegister {
 
     /// Records that all troubles of a kind are over, for all subjects.
     pub fn settle_all(&mut self, kind: TroubleKind) {
-        let of_kind = self
-            .entries
-            .iter_mut()
-            .filter(|((_, noted), _)| *noted == kind);
+        let of_kind = self.entries.iter_mut().filter(|(key, _)| key.kind == kind);
         of_kind.for_each(|(_, entry)| entry.is_settled = true);
     }
 
@@ -359,7 +361,7 @@ impl TroubleRegister {
     pub fn present(&self, now: Timestamp) -> Vec<Trouble> {
         self.entries
             .iter()
-            .filter(|((_, kind), entry)| entry.is_present(*kind, now))
+            .filter(|(key, entry)| entry.is_present(key.kind, now))
             .map(|(_, entry)| entry.shown.clone())
             .take(MAX_TROUBLES)
             .collect()
@@ -367,20 +369,20 @@ impl TroubleRegister {
 
     /// True if there is room for one more entry. Lapsed entries of the same group are removed if
     /// necessary, the longest unseen first.
-    fn make_room(&mut self, (about, kind): &Key, now: Timestamp) -> bool {
-        if about.is_none() {
+    fn make_room(&mut self, key: &Key, now: Timestamp) -> bool {
+        if key.about.is_none() {
             return true;
         }
-        let vehicle = about.as_deref().map(vehicle_of);
-        let is_of_vehicle = |(other, kind): &Key| {
-            other.as_deref().map(vehicle_of) == vehicle && !kind.is_of_strangers()
+        let vehicle = key.about.as_deref().map(vehicle_of);
+        let is_of_vehicle = |other: &Key| {
+            other.about.as_deref().map(vehicle_of) == vehicle && !other.kind.is_of_strangers()
         };
-        let has_share = if kind.is_of_strangers() {
-            self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers())
+        let has_share = if key.kind.is_of_strangers() {
+            self.make_room_in(MAX_OF_STRANGERS, now, |other| other.kind.is_of_strangers())
         } else {
             self.make_room_in(MAX_ABOUT_ONE, now, is_of_vehicle)
         };
-        has_share && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
+        has_share && self.make_room_in(MAX_ABOUT_OTHERS, now, |other| other.about.is_some())
     }
 
     /// The same check for one group of at most `most` entries.
@@ -389,7 +391,7 @@ impl TroubleRegister {
             let lapsed = self
                 .entries
                 .iter()
-                .filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
+                .filter(|(key, entry)| is_in(key) && !entry.is_present(key.kind, now));
             let oldest = lapsed.min_by_key(|(_, entry)| entry.seen_at);
             let Some(key) = oldest.map(|(key, _)| key.clone()) else {
                 return false;
@@ -405,7 +407,10 @@ fn key(kind: TroubleKind, about: Option<&str>) -> Key {
         name if name.is_empty() => "without a name".to_owned(),
         name => name,
     };
-    (about.map(name), kind)
+    Key {
+        about: about.map(name),
+        kind,
+    }
 }
 
 /// A text of at most `max_bytes` bytes, with an ellipsis after the last whole word if it is longer.

@@ -397,8 +397,7 @@ impl Vote {
         let objects = readings
             .iter()
             .filter(|(label, _)| *label != sign)
-            .flat_map(|(_, nodes)| nodes);
-        let objects = objects
+            .flat_map(|(_, nodes)| nodes)
             .filter(|other| *other != node && self.method.get().is_trusted(other))
             .count();
         objects > 0 && objects >= signs.len()
@@ -415,10 +414,11 @@ impl Vote {
             self.signs.get(landmark),
         ) {
             let votes: BTreeSet<NodeName> = readings.values().flatten().cloned().collect();
-            let fresh = signs
+            let fresh: Vec<_> = signs
                 .iter()
-                .filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
-            let fresh: Vec<_> = fresh.map(|(node, _)| node.clone()).collect();
+                .filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node))
+                .map(|(node, _)| node.clone())
+                .collect();
             if !fresh.is_empty() {
                 readings
                     .entry(self.voted_label(known, &sign.label).clone())

@@ -165,13 +165,14 @@ pub type Starting = Pin<Box<dyn Future<Output = Result<NodeHandle, NodeError>> +
 pub fn start(config: NodeConfig) -> Starting {
     Box::pin(async move {
         let vehicle = VehicleParts::new(&config);
-        start_with((vehicle, Presence::Whole), config).await
+        start_with(vehicle, Presence::Whole, config).await
     })
 }
 
 /// Starts a node of a vehicle up to its presence.
 async fn start_with(
-    vehicle: (VehicleParts, Presence),
+    vehicle: VehicleParts,
+    presence: Presence,
     config: NodeConfig,
 ) -> Result<NodeHandle, NodeError> {
     let security = config
@@ -187,8 +188,8 @@ async fn start_with(
         .dashboard
         .load_floor_plan()
         .map_err(|error| NodeError::Failed(error.to_string()))?;
-    let builder =
-        NodeBuilder::new(vehicle, config, security, held, failed).with_floor_plan(floor_plan);
+    let builder = NodeBuilder::new(vehicle, presence, config, security, held, failed)
+        .with_floor_plan(floor_plan);
     let newest = builder.newest();
     let broker = builder.broker_address();
     let gossip = builder.gossip_address();

@@ -145,10 +145,13 @@ pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
 fn summary(view: &CellView) -> Paragraph<'_> {
     let leader = match (view.leadership.leader(), &view.leadership.epoch) {
         (Some(leader), Some(epoch)) => {
-            let since = view.history.back().filter(|(newest, _)| newest == epoch);
-            let since = since.map_or_else(String::new, |(_, at)| {
-                format!(", seen for {}", in_words(view.now.since(*at)))
-            });
+            let since = view
+                .history
+                .back()
+                .filter(|(newest, _)| newest == epoch)
+                .map_or_else(String::new, |(_, at)| {
+                    format!(", seen for {}", in_words(view.now.since(*at)))
+                });
             let standby = view
                 .leadership
                 .standby
@@ -295,17 +298,17 @@ fn location_rows(view: &CellView) -> Vec<Row<'static>> {
             &entry.contributors,
         )
     });
-    let voted_only =
-        verdicts().filter(|verdict| landmarks().all(|entry| entry.id != verdict.landmark));
-    let voted_only = voted_only.map(|verdict| {
-        row(
-            verdict.landmark.to_string(),
-            "",
-            None,
-            Some(verdict),
-            &verdict.contributors,
-        )
-    });
+    let voted_only = verdicts()
+        .filter(|verdict| landmarks().all(|entry| entry.id != verdict.landmark))
+        .map(|verdict| {
+            row(
+                verdict.landmark.to_string(),
+                "",
+                None,
+                Some(verdict),
+                &verdict.contributors,
+            )
+        });
     let objects = view
         .map
         .iter()
@@ -353,15 +356,15 @@ fn vehicles(view: &CellView) -> Table<'_> {
     let others = reputations
         .into_iter()
         .flat_map(|reputations| reputations.keys())
-        .filter(|node| !is_member(node));
-    let others = others.map(|node| {
-        Row::new([
-            node.to_string(),
-            "mqtt".to_owned(),
-            String::new(),
-            trusted(node),
-        ])
-    });
+        .filter(|node| !is_member(node))
+        .map(|node| {
+            Row::new([
+                node.to_string(),
+                "mqtt".to_owned(),
+                String::new(),
+                trusted(node),
+            ])
+        });
     let rows: Vec<_> = members.chain(others).collect();
     let title = format!(
         " {} node{} ",

@@ -5,26 +5,23 @@
 use std::hint::black_box;
 use std::sync::Arc;
 
-use ecod::leadership::election::{Election, ElectionEffect, ElectionInput};
-use ecod::model::detection::Detection;
-use ecod::model::geometry::Pose;
-use ecod::model::names::NodeName;
-use ecod::model::time::Timestamp;
+use ecod::leadership::election::{Election, ElectionEffect};
 use ecod::pace::Pace;
 use ecod::perception::projection::{Cut, Projection};
 use ecod::tracking::Tracker;
 use ecod::vote::Vote;
 use ecod::wire::{Encoding, Limits, ObjectReport, decode_report};
-use ecod_instructions as workload;
+use ecod_instructions::{self as workload, Boxes, Following, Payload, Round};
 use gungraun::{library_benchmark, library_benchmark_group, main};
 
 #[library_benchmark]
 #[bench::of_1000_boxes(workload::boxes())]
-fn projection((projection, camera, detections): (Projection, Pose, Vec<Detection>)) -> Projection {
-    for detection in &detections {
+fn projection(boxes: Boxes) -> Projection {
+    let projection = boxes.projection;
+    for detection in &boxes.detections {
         black_box(
             projection
-                .place(detection, Cut::default(), None, &camera)
+                .place(detection, Cut::default(), None, &boxes.camera)
                 .ok(),
         );
     }
@@ -33,33 +30,34 @@ fn projection((projection, camera, detections): (Projection, Pose, Vec<Detection
 
 #[library_benchmark]
 #[bench::of_1024_objects(workload::pace())]
-fn pace_round((mut pace, reports, now): (Pace, Vec<ObjectReport>, Timestamp)) -> Pace {
-    for report in &reports {
-        pace.observe(report, now);
+fn pace_round(round: Round<Pace, ObjectReport>) -> Pace {
+    let mut pace = round.algorithm;
+    for report in &round.reports {
+        pace.observe(report, round.now);
     }
-    black_box(pace.close(now));
+    black_box(pace.close(round.now));
     pace
 }
 
 #[library_benchmark]
 #[bench::of_1024_objects(workload::tracks())]
-fn tracks_round(
-    (mut tracker, reports, now): (Tracker, Vec<Arc<ObjectReport>>, Timestamp),
-) -> Tracker {
-    for report in reports {
-        black_box(tracker.observe(report, now));
+fn tracks_round(round: Round<Tracker, Arc<ObjectReport>>) -> Tracker {
+    let mut tracker = round.algorithm;
+    for report in round.reports {
+        black_box(tracker.observe(report, round.now));
     }
-    black_box(tracker.close(now));
+    black_box(tracker.close(round.now));
     tracker
 }
 
 #[library_benchmark]
 #[bench::of_1024_votes(workload::vote())]
-fn vote_round((mut vote, reports, now): (Vote, Vec<ObjectReport>, Timestamp)) -> Vote {
-    for report in &reports {
-        black_box(vote.observe(report, now).ok());
+fn vote_round(round: Round<Vote, ObjectReport>) -> Vote {
+    let mut vote = round.algorithm;
+    for report in &round.reports {
+        black_box(vote.observe(report, round.now).ok());
     }
-    black_box(vote.close(now));
+    black_box(vote.close(round.now));
     vote
 }
 
@@ -67,16 +65,16 @@ fn vote_round((mut vote, reports, now): (Vote, Vec<ObjectReport>, Timestamp)) ->
 #[bench::json(workload::payload(Encoding::Json))]
 #[bench::cbor(workload::payload(Encoding::Cbor))]
 #[bench::compact(workload::payload(Encoding::Compact))]
-fn decode_32_objects((bytes, node): (Vec<u8>, NodeName)) -> Option<ObjectReport> {
+fn decode_32_objects(payload: Payload) -> Option<ObjectReport> {
+    let Payload { bytes, node } = payload;
     decode_report(&bytes, &node, &Limits::default()).ok()
 }
 
 #[library_benchmark]
 #[bench::of_a_beat(workload::following())]
-fn election_step(
-    (mut election, beat, now): (Election, ElectionInput, Timestamp),
-) -> (Election, Vec<ElectionEffect>) {
-    let effects = election.handle(beat, now);
+fn election_step(following: Following) -> (Election, Vec<ElectionEffect>) {
+    let mut election = following.election;
+    let effects = election.handle(following.beat, following.now);
     (election, effects)
 }
 

@@ -8,7 +8,7 @@ use std::hint::black_box;
 
 use ecod::perception::projection::Cut;
 use ecod::wire::{Encoding, Limits, decode_report};
-use ecod_instructions as workload;
+use ecod_instructions::{self as workload, Boxes, Payload, Round};
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -22,7 +22,11 @@ fn main() {
     let is_done = times != "0";
     match name.as_str() {
         "projection" => {
-            let (projection, camera, detections) = workload::boxes();
+            let Boxes {
+                projection,
+                camera,
+                detections,
+            } = workload::boxes();
             for detection in detections.iter().filter(|_| is_done) {
                 black_box(
                     projection
@@ -32,7 +36,11 @@ fn main() {
             }
         }
         "pace_round" => {
-            let (mut pace, reports, now) = workload::pace();
+            let Round {
+                algorithm: mut pace,
+                reports,
+                now,
+            } = workload::pace();
             if is_done {
                 for report in &reports {
                     pace.observe(report, now);
@@ -41,7 +49,11 @@ fn main() {
             }
         }
         "vote_round" => {
-            let (mut vote, reports, now) = workload::vote();
+            let Round {
+                algorithm: mut vote,
+                reports,
+                now,
+            } = workload::vote();
             if is_done {
                 for report in &reports {
                     black_box(vote.observe(report, now).ok());
@@ -50,7 +62,7 @@ fn main() {
             }
         }
         "decode_compact" => {
-            let (bytes, node) = workload::payload(Encoding::Compact);
+            let Payload { bytes, node } = workload::payload(Encoding::Compact);
             if is_done {
                 black_box(decode_report(&bytes, &node, &Limits::default()).ok());
             }

@@ -29,7 +29,45 @@ const OBJECTS: usize = 32;
 const LANDMARKS: usize = 256;
 
 /// A thousand boxes, and what places them.
-pub fn boxes() -> (Projection, Pose, Vec<Detection>) {
+pub struct Boxes {
+    /// The projection.
+    pub projection: Projection,
+    /// Pose of the camera.
+    pub camera: Pose,
+    /// The boxes.
+    pub detections: Vec<Detection>,
+}
+
+/// An algorithm after some rounds, and the reports of the next round.
+pub struct Round<A, R> {
+    /// The algorithm.
+    pub algorithm: A,
+    /// The reports.
+    pub reports: Vec<R>,
+    /// Time of the round.
+    pub now: Timestamp,
+}
+
+/// An encoded report.
+pub struct Payload {
+    /// The report.
+    pub bytes: Vec<u8>,
+    /// The node whose report it is.
+    pub node: NodeName,
+}
+
+/// A node that follows a leader, and the leader's next beat.
+pub struct Following {
+    /// The node.
+    pub election: Election,
+    /// The beat.
+    pub beat: ElectionInput,
+    /// Time of the beat.
+    pub now: Timestamp,
+}
+
+/// A thousand boxes, and what places them.
+pub fn boxes() -> Boxes {
     let intrinsics =
         Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
     let size = ObjectSize {
@@ -47,11 +85,11 @@ pub fn boxes() -> (Projection, Pose, Vec<Detection>) {
         sizes,
         ..ProjectionConfig::default()
     };
-    (
-        Projection::new(config, intrinsics, Mount::default()),
-        Pose::new(0.6, 0.5, 2.9),
-        (0..1000).map(detection).collect(),
-    )
+    Boxes {
+        projection: Projection::new(config, intrinsics, Mount::default()),
+        camera: Pose::new(0.6, 0.5, 2.9),
+        detections: (0..1000).map(detection).collect(),
+    }
 }
 
 fn detection(index: usize) -> Detection {
@@ -73,7 +111,7 @@ fn detection(index: usize) -> Detection {
 }
 
 /// PACE after ten rounds, and the reports of the next: 32 vehicles, 32 objects each, 256 locations.
-pub fn pace() -> (Pace, Vec<ObjectReport>, Timestamp) {
+pub fn pace() -> Round<Pace, ObjectReport> {
     let landmarks = (0..LANDMARKS).map(landmark).collect();
     let config = PaceConfig::default();
     let mut pace = Pace::new(
@@ -89,11 +127,15 @@ pub fn pace() -> (Pace, Vec<ObjectReport>, Timestamp) {
         pace.close(now);
     }
     now = now + Duration::from_millis(100);
-    (pace, reports(10, now), now)
+    Round {
+        algorithm: pace,
+        reports: reports(10, now),
+        now,
+    }
 }
 
 /// Tracks after twenty rounds, and the reports of the next: 32 vehicles, 32 objects each, of 256 that stand nine metres apart.
-pub fn tracks() -> (Tracker, Vec<Arc<ObjectReport>>, Timestamp) {
+pub fn tracks() -> Round<Tracker, Arc<ObjectReport>> {
     let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
     let apart = |object: PerceivedObject| PerceivedObject {
         landmark: None,
@@ -119,11 +161,15 @@ pub fn tracks() -> (Tracker, Vec<Arc<ObjectReport>>, Timestamp) {
         tracker.close(now);
     }
     now = now + Duration::from_millis(100);
-    (tracker, reports(20, now), now)
+    Round {
+        algorithm: tracker,
+        reports: reports(20, now),
+        now,
+    }
 }
 
 /// VOTE after ten rounds, and the votes of the next: 32 vehicles, 32 votes each on 256 locations.
-pub fn vote() -> (Vote, Vec<ObjectReport>, Timestamp) {
+pub fn vote() -> Round<Vote, ObjectReport> {
     let mut vote = Vote::new(
         VoteConfig::default(),
         (0..LANDMARKS).map(landmark).collect(),
@@ -137,17 +183,24 @@ pub fn vote() -> (Vote, Vec<ObjectReport>, Timestamp) {
         vote.close(now);
     }
     now = now + Duration::from_millis(100);
-    (vote, reports(10, now), now)
+    Round {
+        algorithm: vote,
+        reports: reports(10, now),
+        now,
+    }
 }
 
 /// A report of 32 objects in an encoding, and whose it is.
-pub fn payload(encoding: Encoding) -> (Vec<u8>, NodeName) {
+pub fn payload(encoding: Encoding) -> Payload {
     let report = reports(1, NOON).swap_remove(7);
-    (encode(&report, encoding), report.node)
+    Payload {
+        bytes: encode(&report, encoding),
+        node: report.node,
+    }
 }
 
 /// A node that follows a leader, and the leader's next beat.
-pub fn following() -> (Election, ElectionInput, Timestamp) {
+pub fn following() -> Following {
     let mut election = Election::new(
         ElectionConfig::default(),
         NodeName::from_static("euclid"),
@@ -180,7 +233,11 @@ pub fn following() -> (Election, ElectionInput, Timestamp) {
         Some(&NodeName::from_static("edge")),
         "the node follows"
     );
-    (election, beat(100), now + Duration::from_millis(50))
+    Following {
+        election,
+        beat: beat(100),
+        now: now + Duration::from_millis(50),
+    }
 }
 
 fn beat(seq: u64) -> ElectionInput {

@@ -3,7 +3,7 @@
 //! One vehicle reports in its own moving frame, because the recording has no poses in a fixed frame.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::Context;
 use ecod::model::names::NodeName;
@@ -31,7 +31,8 @@ pub(super) const FITTED: usize = 6;
 pub(super) fn convert(
     name: &'static str,
     sequences: &[&str],
-    (detections, truth): &(PathBuf, PathBuf),
+    detections: &Path,
+    truth: &Path,
     work: &Path,
 ) -> anyhow::Result<Recording> {
     let folders = ["truth", "detections"].map(|kind| work.join(kind));

@@ -114,12 +114,12 @@ fn main() -> anyhow::Result<()> {
         COLUMNS.join(" | "),
         "---|".repeat(COLUMNS.len())
     );
-    if let Some(kitti) = kitti {
+    if let Some((detections, truth)) = kitti {
         let last = &kitti::SEQUENCES[kitti::FITTED..];
         for (name, sequences) in [("KITTI", &kitti::SEQUENCES[..]), ("KITTI, last five", last)] {
             judge(
                 &program,
-                &kitti::convert(name, sequences, &kitti, &folder(&work, name)?)?,
+                &kitti::convert(name, sequences, &detections, &truth, &folder(&work, name)?)?,
             )?;
         }
     }

@@ -70,33 +70,33 @@ impl Wildtrack {
         };
         let boxes = serde_json::from_str(&read(boxes)?)?;
         let cameras: Value = serde_json::from_str(&read(cameras)?)?;
-        let homographies: Vec<[[f64; 3]; 3]> =
+        let matrices: Vec<[[f64; 3]; 3]> =
             serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
-        let homographies: Vec<Matrix3<f64>> = homographies
+        let homographies: Vec<Matrix3<f64>> = matrices
             .iter()
             .map(|rows| Matrix3::from_fn(|row, column| rows[row][column]))
             .collect();
-        let cameras: Option<Vec<_>> = homographies.iter().map(GroundCamera::new).collect();
-        let cameras = cameras.context("a homography of no pinhole camera")?;
+        let cameras = homographies
+            .iter()
+            .map(GroundCamera::new)
+            .collect::<Option<Vec<_>>>()
+            .context("a homography of no pinhole camera")?;
         let mut positions: BTreeMap<u64, Vec<Point2<f64>>> = BTreeMap::new();
         for (number, line) in read(truth)?.lines().enumerate() {
-            let cells: Option<Vec<u64>> = line
+            let [frame, x, y]: [u64; 3] = line
                 .split_ascii_whitespace()
                 .map(|cell| cell.parse().ok())
-                .collect();
-            let cells: [u64; 3] =
-                cells
-                    .and_then(|cells| cells.try_into().ok())
-                    .with_context(|| {
-                        format!(
-                            "{}: line {}: not three numbers",
-                            truth.display(),
-                            number + 1
-                        )
-                    })?;
-            let [frame, x, y] = cells;
-            let place = [x as f64, y as f64];
-            let place: [f64; 2] = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
+                .collect::<Option<Vec<u64>>>()
+                .and_then(|cells| cells.try_into().ok())
+                .with_context(|| {
+                    format!(
+                        "{}: line {}: not three numbers",
+                        truth.display(),
+                        number + 1
+                    )
+                })?;
+            let cell = [x as f64, y as f64];
+            let place: [f64; 2] = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * cell[axis]);
             positions
                 .entry(frame / TRUTH_FRAMES)
                 .or_default()
@@ -113,12 +113,12 @@ impl Wildtrack {
     pub(super) fn convert(&self, work: &Path) -> anyhow::Result<Recording> {
         let truth = work.join("truth.txt");
         let reports = work.join("reports.jsonl");
-        let to_ground: Option<Vec<_>> = self
+        let to_ground = self
             .homographies
             .iter()
             .map(|homography| homography.try_inverse())
-            .collect();
-        let to_ground = to_ground.context("a homography has no inverse")?;
+            .collect::<Option<Vec<_>>>()
+            .context("a homography has no inverse")?;
         let mut places = String::new();
         let mut all = String::new();
         let mut late_fusion = String::new();
@@ -164,15 +164,14 @@ impl Wildtrack {
             .zip(alone)
             .map(|(camera, lines)| (format!("camera {camera}"), lines));
         let others = [("detections".to_owned(), all)].into_iter().chain(alone);
-        let others =
-            others
-                .chain([("late fusion".to_owned(), late_fusion)])
-                .map(|(method, lines)| {
-                    let path = work.join(format!("{method}.txt"));
-                    fs::write(&path, lines)?;
-                    anyhow::Ok((method, path))
-                });
-        let others = others.collect::<Result<_, _>>()?;
+        let others = others
+            .chain([("late fusion".to_owned(), late_fusion)])
+            .map(|(method, lines)| {
+                let path = work.join(format!("{method}.txt"));
+                fs::write(&path, lines)?;
+                anyhow::Ok((method, path))
+            })
+            .collect::<Result<_, _>>()?;
         fs::write(&truth, places)?;
         write_reports(&reports, reported)?;
         Ok(Recording {

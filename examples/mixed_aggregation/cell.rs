@@ -130,13 +130,15 @@ impl Cell {
                 None if place.observers.is_empty() => "?".into(),
                 None => "-".into(),
             });
-        let votes = verdicts.iter().flat_map(|verdicts| &verdicts.verdicts);
-        let votes = votes.map(|verdict| {
-            verdict
-                .label
-                .as_ref()
-                .map_or("?".into(), ToString::to_string)
-        });
+        let votes = verdicts
+            .iter()
+            .flat_map(|verdicts| &verdicts.verdicts)
+            .map(|verdict| {
+                verdict
+                    .label
+                    .as_ref()
+                    .map_or("?".into(), ToString::to_string)
+            });
         (
             map.collect::<Vec<_>>().join(" "),
             votes.collect::<Vec<_>>().join(" "),

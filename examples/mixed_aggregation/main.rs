@@ -89,8 +89,9 @@ async fn play(cell: &mut Cell) -> anyhow::Result<()> {
     for step in SCRIPT {
         let from = clock::now();
         println!("{:>5.1} s  {}", age(), carry_out(&step, cell).await?);
-        let epoch = tokio::time::timeout(PATIENCE, recovered(cell)).await;
-        let epoch = epoch.with_context(|| format!("no leader serves all within {PATIENCE:?}"))?;
+        let epoch = tokio::time::timeout(PATIENCE, recovered(cell))
+            .await
+            .with_context(|| format!("no leader serves all within {PATIENCE:?}"))?;
         let recovered_at = age();
         tokio::time::sleep(CALM).await;
         let Record { gap_ms, .. } = cell.record(from)?;
@@ -110,11 +111,11 @@ async fn carry_out(step: &Step, cell: &mut Cell) -> anyhow::Result<String> {
             "edge started".into()
         }
         Step::StartVehicles => {
-            let missing = SEEN
+            let missing: Vec<_> = SEEN
                 .iter()
                 .map(|(name, _)| *name)
-                .filter(|name| !cell.nodes.contains_key(name));
-            let missing: Vec<_> = missing.collect();
+                .filter(|name| !cell.nodes.contains_key(name))
+                .collect();
             for name in &missing {
                 cell.start(name, Role::Auto).await?;
             }

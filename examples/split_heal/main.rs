@@ -217,11 +217,11 @@ impl Cell {
             .iter()
             .filter(|vehicle| vehicle.leadership.is_leading())
             .count();
-        let sources = self
+        let sources: BTreeSet<_> = self
             .vehicles
             .iter()
-            .map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)));
-        let sources: BTreeSet<_> = sources.collect();
+            .map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)))
+            .collect();
         ensure!(
             leaders == 1 && sources.len() == 1,
             "{leaders} lead, and maps come from {sources:?}"

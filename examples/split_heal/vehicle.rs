@@ -324,8 +324,8 @@ impl Vehicle {
                 let brokers = self
                     .members
                     .values()
-                    .filter_map(|member| member.broker.clone());
-                let brokers = brokers.chain([broker(self.index).into()]);
+                    .filter_map(|member| member.broker.clone())
+                    .chain([broker(self.index).into()]);
                 let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
                 let sample = HealthSample {
                     broker_serves: true,

@@ -118,9 +118,10 @@ impl RosOptions {
                 .validate()
                 .map_err(|error| format!("{}: {error}", file.display()))?;
         }
-        let in_pictures = self.detections_2d.zip(self.camera_info);
-        let in_pictures =
-            in_pictures.map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
+        let in_pictures = self
+            .detections_2d
+            .zip(self.camera_info)
+            .map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
         let input = self
             .detections_3d
             .map(DetectorTopics::InSpace)

@@ -205,8 +205,10 @@ pub fn free_address() -> anyhow::Result<SocketAddr> {
 }
 
 fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
-    let output = File::options().append(true).open(log);
-    let output = output.with_context(|| format!("cannot write {}", log.display()))?;
+    let output = File::options()
+        .append(true)
+        .open(log)
+        .with_context(|| format!("cannot write {}", log.display()))?;
     let mut command = Command::new(program);
     // The node must only use its file, so variables of the environment are removed.
     for (key, _) in

@@ -116,16 +116,17 @@ impl Section for Objects {
 
     fn html(&self) -> String {
         let scores = self.0.clone().result();
-        let tables = tables(&scores);
-        let tables = tables.iter().filter_map(|rows| rows.split_first());
-        let tables = tables
-            .map(|(head, rows)| table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows));
+        let tables: String = tables(&scores)
+            .iter()
+            .filter_map(|rows| rows.split_first())
+            .map(|(head, rows)| table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows))
+            .collect();
         let warning =
             without_map(&scores).map_or_else(String::new, |warning| format!(" {warning}."));
         let about = format!(
             "Objects of maps judged by where the true ones were, in {} frames.{warning}",
             scores.frames
         );
-        section("Accuracy of objects", &about, &tables.collect::<String>())
+        section("Accuracy of objects", &about, &tables)
     }
 }

@@ -380,10 +380,9 @@ fn judge(
         let mut ids = HashMap::new();
         for frame in &truth.frames {
             let moment = moment(cells, frame.t_us);
-            let said = moment
+            let said: Vec<SaidObject> = moment
                 .iter()
-                .filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
-            let said: Vec<SaidObject> = said
+                .filter(|object| is_part(&Point2::new(object.x_m, object.y_m)))
                 .map(|object| SaidObject::of(object, &mut ids))
                 .collect();
             judge.said(frame.t_us, &said);

@@ -47,8 +47,10 @@ impl CellAccount {
     pub fn reads(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
-        let around = tile.with_neighbours().into_iter();
-        let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
+        let around = tile
+            .with_neighbours()
+            .into_iter()
+            .flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
         [RegionTopic::filter_of_cell(*tile, cell)]
             .into_iter()
             .chain(around)

@@ -149,11 +149,13 @@ async fn subscribe(
         }
         if !new.is_empty() {
             let filters: Vec<_> = new.into_iter().collect();
-            lock(asked).push_back(filters.clone());
-            let filters = filters
-                .into_iter()
-                .map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
-            let _ = client.subscribe_many(filters).await;
+            let subscriptions: Vec<_> = filters
+                .iter()
+                .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce))
+                .collect();
+            lock(asked).push_back(filters);
+            // The next login subscribes anew if the connection has ended.
+            let _ = client.subscribe_many(subscriptions).await;
         }
         present = wanted;
         // A connection that ended in the meantime reads no more messages.
@@ -199,8 +201,10 @@ async fn poll(
             Ok(Event::Incoming(Packet::SubAck(answer))) => {
                 let filters = lock(asked).pop_front().unwrap_or_default();
                 let answers = filters.into_iter().zip(answer.return_codes);
-                let refused = answers.filter(|(_, code)| *code == SubscribeReasonCode::Failure);
-                let refused: Vec<_> = refused.map(|(filter, _)| filter).collect();
+                let refused: Vec<_> = answers
+                    .filter(|(_, code)| *code == SubscribeReasonCode::Failure)
+                    .map(|(filter, _)| filter)
+                    .collect();
                 if !refused.is_empty() {
                     let trouble =
                         format!("the broker lets this user not read {}", refused.join(", "));

@@ -199,9 +199,9 @@ impl RegionTown {
         payload: &[u8],
         now: Timestamp,
     ) -> Result<Accepted, CellRefusal> {
-        let topic =
-            RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
-        let topic = topic.ok_or(RejectReason::UnknownTopic)?;
+        let topic = RegionTopic::parse(path)
+            .filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS)
+            .ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
         if !self.throttle.allow(&topic, now) {
             self.lose(

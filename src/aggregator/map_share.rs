@@ -53,8 +53,11 @@ fn bytes_of(object: &FusedObject) -> usize {
         .scores
         .keys()
         .map(|label| escaped(label) + SCORE_BYTES);
-    let names = object.contributors.iter().chain(&object.vehicle);
-    let names = names.map(|name| name.as_str().len());
+    let names = object
+        .contributors
+        .iter()
+        .chain(&object.vehicle)
+        .map(|name| name.as_str().len());
     NUMBERS_BYTES + escaped(&object.label) + scores.sum::<usize>() + names.sum::<usize>()
 }
 

@@ -290,11 +290,11 @@ impl LedgerResync {
         if self.repeats > 0 {
             self.shared.merge_share(&taken, self.leader.as_ref());
         }
-        let present = self
+        let present_lane = self
             .lane_of_leader(leadership)
             .or(leadership.epoch.as_ref())
             .cloned();
-        let present = present.as_ref();
+        let present = present_lane.as_ref();
         let taken = Arc::new(taken);
         let is_statement = self.is_signed
             && taken

@@ -196,9 +196,8 @@ impl Projection {
                 whole(cut.lower)?;
                 let (foot, head) = box_height::foot_and_head(bounds, self);
                 let half = HalfDepth::of(known, bounds, &foot, self);
-                let estimate = ground::from_foot(&foot, half, self);
-                let estimate =
-                    estimate.ok_or_else(|| ProjectionError::AboveHorizon(label.clone()))?;
+                let estimate = ground::from_foot(&foot, half, self)
+                    .ok_or_else(|| ProjectionError::AboveHorizon(label.clone()))?;
                 Ok(estimate.along(
                     &foot,
                     half.middle_sigma_m(estimate.distance_m, cut, &head, self),

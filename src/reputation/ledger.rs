@@ -183,11 +183,11 @@ impl ReputationLedger {
     }
 
     /// (correct, incorrect) among each vehicle's `memory_votes` latest votes.
-    fn latest(&self, memory_votes: f64) -> BTreeMap<&NodeName, (f64, f64)> {
+    pub(crate) fn latest(&self, memory_votes: f64) -> BTreeMap<&NodeName, (f64, f64)> {
         let mut latest: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
         for (node, record) in self.latest_first() {
             let sum = latest.entry(node).or_default();
-            let (correct, incorrect) = record.latest((0.0, memory_votes - (sum.0 + sum.1)));
+            let (correct, incorrect) = record.latest(0.0, memory_votes - (sum.0 + sum.1));
             *sum = (sum.0 + correct, sum.1 + incorrect);
         }
         latest
@@ -201,24 +201,28 @@ impl ReputationLedger {
         memory_votes: f64,
         own: impl Fn(&NodeName) -> u64,
     ) -> BTreeMap<NodeName, RememberedVotes> {
-        let mut rooms: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
+        /// Votes of a vehicle that are still to be skipped, and to be taken.
+        struct Room {
+            skip: f64,
+            take: f64,
+        }
+        let mut rooms: BTreeMap<&NodeName, Room> = BTreeMap::new();
         let mut remembered: BTreeMap<NodeName, RememberedVotes> = BTreeMap::new();
         for (node, record) in self.latest_first() {
-            let room = rooms
-                .entry(node)
-                .or_insert_with(|| (own(node) as f64, memory_votes));
-            let (correct, incorrect) = record.latest(*room);
-            room.0 = (room.0 - record.sum.total() as f64).max(0.0);
-            room.1 -= correct + incorrect;
-            let shares = (
-                correct / record.sum.correct.max(1) as f64,
-                incorrect / record.sum.incorrect.max(1) as f64,
-            );
+            let room = rooms.entry(node).or_insert_with(|| Room {
+                skip: own(node) as f64,
+                take: memory_votes,
+            });
+            let (correct, incorrect) = record.latest(room.skip, room.take);
+            room.skip = (room.skip - record.sum.total() as f64).max(0.0);
+            room.take -= correct + incorrect;
+            let share_correct = correct / record.sum.correct.max(1) as f64;
+            let share_incorrect = incorrect / record.sum.incorrect.max(1) as f64;
             let labels = remembered.entry(node.clone()).or_default();
             for (label, counts) in &record.labels {
                 let sum = labels.entry(label.clone()).or_default();
-                sum.0 += shares.0 * counts.correct as f64;
-                sum.1 += shares.1 * counts.incorrect as f64;
+                sum.0 += share_correct * counts.correct as f64;
+                sum.1 += share_incorrect * counts.incorrect as f64;
             }
         }
         remembered

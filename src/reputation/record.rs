@@ -18,7 +18,7 @@ pub(super) struct Record {
 impl Record {
     /// (correct, incorrect) among the at most `room` latest votes that remain after the very latest
     /// `skip` votes.
-    pub(super) fn latest(&self, (mut skip, mut room): (f64, f64)) -> (f64, f64) {
+    pub(super) fn latest(&self, mut skip: f64, mut room: f64) -> (f64, f64) {
         let mut correct = 0.0;
         let mut incorrect = 0.0;
         let mut end = self.sum;

@@ -162,10 +162,12 @@ impl Coverage {
 /// factor of at most two, and need no trigonometry.
 pub(super) fn turn(offset: &Vector2<f64>) -> f64 {
     let share = offset.y / (offset.x.abs() + offset.y.abs()).max(f64::MIN_POSITIVE) / 4.0;
-    match offset.x < 0.0 {
-        true => 0.5 - share,
-        false if share < 0.0 => 1.0 + share,
-        false => share,
+    if offset.x < 0.0 {
+        0.5 - share
+    } else if share < 0.0 {
+        1.0 + share
+    } else {
+        share
     }
 }
 

@@ -120,16 +120,13 @@ impl Sensors {
     /// without counts.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
         let config = self.fleet.reputation();
-        let votes = ledger
-            .remembered(config.memory_votes, |_| 0)
+        let mut votes: BTreeMap<NodeName, TrustCounts> = ledger
+            .latest(config.memory_votes)
             .into_iter()
-            .map(|(node, labels)| {
-                let (correct, incorrect) = labels
-                    .values()
-                    .fold((0.0, 0.0), |sum, votes| (sum.0 + votes.0, sum.1 + votes.1));
-                (node, TrustCounts::new(correct, incorrect, config))
-            });
-        let mut votes: BTreeMap<_, _> = votes.collect();
+            .map(|(node, (correct, incorrect))| {
+                (node.clone(), TrustCounts::new(correct, incorrect, config))
+            })
+            .collect();
         for sensor in self.models.iter_mut().flatten() {
             sensor.counts = votes.remove(&sensor.node).unwrap_or_default();
             self.fleet.set_counts(sensor.id, &sensor.counts);

@@ -63,11 +63,14 @@ impl FromStr for ContentHash {
 
     fn from_str(text: &str) -> Result<Self, InvalidHash> {
         let digit = |byte: u8| char::from(byte).to_digit(16).ok_or(InvalidHash);
-        let bytes = text.as_bytes().chunks(2).map(|pair| match *pair {
-            [high, low] => Ok((digit(high)? << 4 | digit(low)?) as u8),
-            _ => Err(InvalidHash),
-        });
-        let bytes = bytes.collect::<Result<Vec<u8>, _>>()?;
+        let bytes = text
+            .as_bytes()
+            .chunks(2)
+            .map(|pair| match *pair {
+                [high, low] => Ok((digit(high)? << 4 | digit(low)?) as u8),
+                _ => Err(InvalidHash),
+            })
+            .collect::<Result<Vec<u8>, _>>()?;
         Ok(Self(bytes.try_into().map_err(|_| InvalidHash)?))
     }
 }

@@ -159,10 +159,10 @@ fn fault(text: &[u8], error: &serde_json::Error) -> String {
         .nth(error.line().saturating_sub(1))
         .unwrap_or_default();
     // The column is at the first letter of a word or next to it.
-    let around = text
+    let rest = text
         .get(error.column().saturating_sub(3)..)
         .unwrap_or_default();
-    let around = around.get(.."-Infinity".len() + 2).unwrap_or(around);
+    let around = rest.get(.."-Infinity".len() + 2).unwrap_or(rest);
     let is_near = |word: &str| {
         around
             .windows(word.len())

@@ -20,7 +20,8 @@ use tokio::sync::{Semaphore, watch};
 use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::timeout;
 
-use crate::camera::detect::Detect;
+use crate::camera::detect::{Detect, DetectError};
+use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::capture::{
     Capture, CaptureConfig, CaptureStatus, Opener, Readers,
 };
@@ -87,6 +88,15 @@ pub struct DetectorState {
     readers: Readers,
 }
 
+/// A frame after the detection, with what the detection thread borrowed from the state.
+struct DetectedFrame {
+    detect: Box<dyn Detect>,
+    images: Option<ImageRecorder>,
+    frame: CameraFrame,
+    outcome: Result<Vec<Detection>, DetectError>,
+    took: Duration,
+}
+
 /// Successive frames that take too long, from which a detector is reported as slow.
 const SLOW_FRAMES: u32 = 3;
 
@@ -127,7 +137,8 @@ impl Actor for Detector {
         pumping.spawn(pump(
             capture,
             myself,
-            (troubles.clone(), Arc::clone(&counters)),
+            troubles.clone(),
+            Arc::clone(&counters),
             spans,
         ));
         let detect = Some(detect);
@@ -175,7 +186,7 @@ impl Actor for Detector {
         let mut images = state.images.take();
         let lens = state.lens;
         let span = tracing::info_span!("detect");
-        let (detect, images, frame, outcome, took) = spawn_blocking(move || {
+        let detected = spawn_blocking(move || {
             let begun = Instant::now();
             let outcome = span.in_scope(|| detect.detect(&frame));
             let took = begun.elapsed();
@@ -183,13 +194,19 @@ impl Actor for Detector {
             if let Some(images) = &mut images {
                 images.offer(&frame, &lens, outcome.as_deref().unwrap_or_default());
             }
-            (detect, images, frame, outcome, took)
+            DetectedFrame {
+                detect,
+                images,
+                frame,
+                outcome,
+                took,
+            }
         })
         .await?;
-        state.detect = Some(detect);
-        state.images = images;
-        state.record_duration(took);
-        match outcome {
+        state.detect = Some(detected.detect);
+        state.images = detected.images;
+        state.record_duration(detected.took);
+        match detected.outcome {
             Ok(mut detections) => {
                 if std::mem::take(&mut state.failing) {
                     state.troubles.settle(TroubleKind::Camera);
@@ -200,7 +217,7 @@ impl Actor for Detector {
                         .camera_feed
                         .as_ref()
                         .is_some_and(|feed| feed.takes(captured_at))
-                        .then_some(frame);
+                        .then_some(detected.frame);
                     state.projector.send(ProjectorMessage::Report {
                         detections,
                         lens,
@@ -261,7 +278,8 @@ impl DetectorState {
 async fn pump(
     capture: Capture,
     detector: ActorRef<DetectorMessage>,
-    (troubles, counters): (CameraTroubles, Arc<Counters>),
+    troubles: CameraTroubles,
+    counters: Arc<Counters>,
     spans: watch::Receiver<Spans>,
 ) {
     let permits = Arc::new(Semaphore::new(1));
@@ -331,8 +349,6 @@ mod tests {
     use ecod::perception::camera::Intrinsics;
 
     use super::*;
-    use crate::camera::detect::DetectError;
-    use crate::camera::frame::CameraFrame;
     use crate::camera::frame_source::SourceConfig;
 
     /// A model that is too large for its machine: each frame takes until the test releases it.

@@ -266,7 +266,7 @@ impl FuserState {
             }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
-                self.note_rejection(reason, (*kind, report), delivery.received_at);
+                self.note_rejection(reason, *kind, report, delivery.received_at);
             }
         }
     }
@@ -276,7 +276,8 @@ impl FuserState {
     fn note_rejection(
         &self,
         reason: RejectReason,
-        (kind, report): (ReportKind, &ObjectReport),
+        kind: ReportKind,
+        report: &ObjectReport,
         received_at: Timestamp,
     ) {
         let node = report.node.as_str();

@@ -344,9 +344,12 @@ impl GatewayState {
             .values()
             .filter(|link| !self.takes_reports_of(&link.broker))
         {
-            let told = link.client.as_ref().map(|client| match wanted {
-                true => client.subscribe(&reports, MaxQos::AtLeastOnce),
-                false => client.unsubscribe(&reports),
+            let told = link.client.as_ref().map(|client| {
+                if wanted {
+                    client.subscribe(&reports, MaxQos::AtLeastOnce)
+                } else {
+                    client.unsubscribe(&reports)
+                }
             });
             tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");
         }

@@ -484,21 +484,15 @@ fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
 }
 
 fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
-    match (config.has_key(), address.ip().is_loopback()) {
-        (true, _) if proves => {
-            tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
-        }
-        (true, _) => {
-            tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for");
-        }
-        (false, false) if proves => {
-            tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set");
-        }
-        (false, true) => {
-            tracing::info!(%address, "looking for nodes on this machine only: no cell key is set");
-        }
-        (false, false) => {
-            tracing::warn!(%address, "looking for nodes of anyone: no cell key is set");
-        }
+    if config.has_key() && proves {
+        tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
+    } else if config.has_key() {
+        tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for");
+    } else if address.ip().is_loopback() {
+        tracing::info!(%address, "looking for nodes on this machine only: no cell key is set");
+    } else if proves {
+        tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set");
+    } else {
+        tracing::warn!(%address, "looking for nodes of anyone: no cell key is set");
     }
 }

@@ -211,7 +211,8 @@ impl UplinkState {
         let limits = self.connection.limits();
         let counters = Arc::clone(&self.setup.counters);
         let sink = RegionInbox::new(
-            (self.setup.cell.clone(), tile),
+            self.setup.cell.clone(),
+            tile,
             self.setup.status.id,
             limits,
             Arc::clone(&counters),

@@ -195,8 +195,12 @@ impl SourceConfig {
         let mut text = text.to_owned();
         if let Self::Url { url } = self {
             text = text.replace(url, &self.origin());
-            let login = url.rsplit_once('@').map_or("", |(login, _)| login);
-            let login = login.split_once("://").map_or(login, |(_, login)| login);
+            let until_host = url
+                .rsplit_once('@')
+                .map_or("", |(until_host, _)| until_host);
+            let login = until_host
+                .split_once("://")
+                .map_or(until_host, |(_, login)| login);
             let password = login.split_once(':').map_or("", |(_, password)| password);
             for secret in [login, password] {
                 if secret.len() >= MIN_SECRET_BYTES {

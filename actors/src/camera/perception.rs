@@ -222,8 +222,9 @@ impl Perception {
             .discarded
             .without_size
             .iter()
-            .map(|(label, times)| format!("{times} of {label}"));
-        let labels = labels.collect::<Vec<_>>().join(", ");
+            .map(|(label, times)| format!("{times} of {label}"))
+            .collect::<Vec<_>>()
+            .join(", ");
         self.discarded
             .is_size_missing
             .then(|| format!("detections have no size and are not reported: {labels}"))
@@ -281,8 +282,7 @@ impl Perception {
         };
         let placed = self
             .projection
-            .place(detection, cut, target.as_ref(), &self.camera);
-        let placed = placed
+            .place(detection, cut, target.as_ref(), &self.camera)
             .map_err(|error| self.discarded.count_unplaced(&error))
             .ok()?;
         // Receivers reject a report with one invalid object, so this is checked per object.

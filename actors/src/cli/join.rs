@@ -136,11 +136,11 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
         .map(Authority::open)
         .transpose()
         .map_err(Failure::usage)?;
-    let authority = match &mut city {
+    let made = match &mut city {
         Some(city) => city.init_cell(&directory.pki(), cell, now),
         None => Authority::init(&directory.pki(), cell, now),
     };
-    let mut authority = authority.map_err(|error| anyhow!(error))?;
+    let mut authority = made.map_err(|error| anyhow!(error))?;
     let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
     authority
         .issue(name, Rights::from(role).of_operator(), valid, now)

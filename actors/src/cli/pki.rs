@@ -125,13 +125,13 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
     let message = match command {
         PkiCommand::Init { ca, cell, city } => {
             let directory = ca.dir.as_deref().unwrap_or(Path::new(AUTHORITY_DIRECTORY));
-            let authority = match city {
+            let made = match city {
                 Some(city) => {
                     Authority::open(city).and_then(|mut city| city.init_cell(directory, cell, now))
                 }
                 None => Authority::init(directory, cell, now),
             };
-            let authority = authority.map_err(failure)?;
+            let authority = made.map_err(failure)?;
             format!(
                 "made a CA for {cell}; copy its certificate to every node: {}\n",
                 shown(&authority.ca())
@@ -215,7 +215,7 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
         }
         CityCommand::Revoke { ca, vehicle, cell } => {
             let mut authority = open(&ca.dir, true)?;
-            let revoked = match (vehicle, cell) {
+            let outcome = match (vehicle, cell) {
                 (Some(vehicle), _) => authority
                     .revoke(vehicle, now)
                     .map(|count| format!("{count} of {vehicle}")),
@@ -224,7 +224,7 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
                     .map(|count| format!("{count} CAs of {cell}")),
                 (None, None) => return Err(anyhow!("name a vehicle, or a cell by --cell").into()),
             };
-            let revoked = revoked.map_err(failure)?;
+            let revoked = outcome.map_err(failure)?;
             let list = shown(&authority.revocation_list());
             format!(
                 "revoked {revoked}; copy the list to every node of the city's cells (no restart needed): {list}\n"

@@ -132,8 +132,10 @@ fn text(running: &RunningNode) -> String {
         node.name, node.role, node.cell, readiness.reason
     );
     if let (Some(leader), Some(term)) = (&leadership.leader, leadership.epoch) {
-        let standby = leadership.standby.as_ref();
-        let standby = standby.map_or_else(String::new, |name| format!(", next {name}"));
+        let standby = leadership
+            .standby
+            .as_ref()
+            .map_or_else(String::new, |name| format!(", next {name}"));
         text += &format!("leader: {leader}, term {term}{standby}\n");
     }
     if let Some(ends) = node.certificate_ends_us {

@@ -77,23 +77,28 @@ fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
         ),
         None => Finding::doubtful("cell", format!("no node of {cell} answers"), fix),
     };
-    let own = node.counters().troubles().present().into_iter();
-    let own = own.filter(|trouble| !is_checked_elsewhere(trouble)).map(
-        |Trouble {
-             kind,
-             about,
-             cause,
-             remedy,
-         }| {
-            let about = about.map_or_else(String::new, |about| format!("{about}: "));
-            let check = if kind == TroubleKind::ClockOff.as_str() {
-                "cell's time"
-            } else {
-                "cell"
-            };
-            Finding::doubtful(check, format!("{about}{cause}"), remedy)
-        },
-    );
+    let own = node
+        .counters()
+        .troubles()
+        .present()
+        .into_iter()
+        .filter(|trouble| !is_checked_elsewhere(trouble))
+        .map(
+            |Trouble {
+                 kind,
+                 about,
+                 cause,
+                 remedy,
+             }| {
+                let about = about.map_or_else(String::new, |about| format!("{about}: "));
+                let check = if kind == TroubleKind::ClockOff.as_str() {
+                    "cell's time"
+                } else {
+                    "cell"
+                };
+                Finding::doubtful(check, format!("{about}{cause}"), remedy)
+            },
+        );
     let name = node
         .members()
         .borrow()

@@ -64,12 +64,14 @@ pub(super) async fn uplink(config: &NodeConfig) -> Option<Finding> {
         .as_ref()
         .filter(|_| config.has_uplink())?;
     let node = config.name.as_ref().map_or("node", NodeName::as_str);
-    let security = config.security().map_err(|error| error.to_string());
-    let security = security.and_then(|security| {
-        security
-            .of_uplink(address.clone(), config.uplink.ca.clone())
-            .map_err(|error| error.to_string())
-    });
+    let security = config
+        .security()
+        .map_err(|error| error.to_string())
+        .and_then(|security| {
+            security
+                .of_uplink(address.clone(), config.uplink.ca.clone())
+                .map_err(|error| error.to_string())
+        });
     let answer = match security {
         Ok(security) => {
             probe(
@@ -127,8 +129,8 @@ pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
             LOOKUP_TIMEOUT,
             crate::transport::gossip::look_up(seed, ipv4),
         )
-        .await;
-        let found = found.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
+        .await
+        .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         findings.push(match found {
             Ok(addresses) => {
                 let addresses: Vec<_> = addresses.iter().map(|address| address.ip().to_string()).collect();
@@ -257,12 +259,15 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     if !multicast.enabled {
         return None;
     }
-    let ip = config.membership.bind.map(|bind| bind.ip());
-    let ip = ip.unwrap_or(IpAddr::from(if config.membership.has_key() {
-        [0, 0, 0, 0]
-    } else {
-        [127, 0, 0, 1]
-    }));
+    let ip = config
+        .membership
+        .bind
+        .map(|bind| bind.ip())
+        .unwrap_or(IpAddr::from(if config.membership.has_key() {
+            [0, 0, 0, 0]
+        } else {
+            [127, 0, 0, 1]
+        }));
     let IpAddr::V4(ip) = ip else { return None };
     let interface = multicast.interface.unwrap_or(ip);
     let returned = || -> io::Result<()> {

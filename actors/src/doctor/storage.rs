@@ -122,12 +122,12 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     }
     let writable = [vec![PathBuf::from(SERVICE_STATE)], unit_paths()].concat();
     let record = config.record.as_ref().map(|record| &record.dir);
-    let written = [
+    let paths = [
         ("state_dir", config.state_dir.as_ref()),
         ("record.dir", record),
         ("map_log", config.map_log.as_ref()),
     ];
-    let written = written
+    let written = paths
         .into_iter()
         .filter_map(|(key, path)| Some((key, absolute(path?))));
     let outside =
@@ -166,8 +166,7 @@ fn absolute(path: &Path) -> PathBuf {
 fn directory(check: &'static str, dir: &Path, needed: u64, key: &str) -> Finding {
     let existing = dir
         .ancestors()
-        .find(|ancestor| ancestor.is_dir() || ancestor.as_os_str().is_empty());
-    let existing = existing
+        .find(|ancestor| ancestor.is_dir() || ancestor.as_os_str().is_empty())
         .filter(|ancestor| !ancestor.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
     // A file in the path prevents the directory.

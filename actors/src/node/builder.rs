@@ -112,7 +112,8 @@ fn lock_state(directory: &Path, cell: &NodeName, name: &NodeName) -> Option<File
 impl NodeBuilder {
     /// Arguments of all parts, under the settings of `held`, if the node can use them.
     pub(super) fn new(
-        (vehicle, presence): (VehicleParts, Presence),
+        vehicle: VehicleParts,
+        presence: Presence,
         own_config: NodeConfig,
         security: Security,
         mut held: HeldDescription,

@@ -421,7 +421,8 @@ impl NodeConfig {
         Security::load(
             self.tls.as_ref().zip(self.name.as_ref()),
             &self.mqtt,
-            (&self.membership, &self.cell),
+            &self.membership,
+            &self.cell,
         )
     }
 

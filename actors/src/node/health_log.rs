@@ -27,8 +27,7 @@ impl HealthLog {
     /// Logs the counters that have changed since the last line; without a change there is no line.
     pub(super) fn log(&mut self, counters: &Counters, frames: &FrameCounters) {
         let snapshot = counters.snapshot();
-        let shed = counters.all_shed().into_iter();
-        let shed = shed.map(|shed| {
+        let shed = counters.all_shed().into_iter().map(|shed| {
             (
                 format!("{} {}", shed.reason.as_str(), shed.source),
                 shed.times,

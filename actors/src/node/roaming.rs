@@ -79,7 +79,7 @@ impl Roamer {
             cells.iter().map(CellEntry::known).collect(),
             config.cell.clone(),
         );
-        let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
+        let present = start_with(vehicle.clone(), Presence::Whole, config.clone()).await?;
         Ok(Self {
             config,
             cells,
@@ -113,7 +113,7 @@ impl Roamer {
         loop {
             tokio::select! {
                 failed = self.present.failed() => failed?,
-                change = next_change(&mut self.next) => self.change(change).await?,
+                (cell, change) = next_change(&mut self.next) => self.change(&cell, change).await?,
                 _ = looks.tick() => self.look().await?,
             }
         }
@@ -181,7 +181,7 @@ impl Roamer {
         {
             return self.fail(&cell, &error).await;
         }
-        match start_with((self.vehicle.clone(), Presence::Beside), config).await {
+        match start_with(self.vehicle.clone(), Presence::Beside, config).await {
             Ok(node) => {
                 self.next = Some((cell, node));
                 Ok(())
@@ -190,10 +190,10 @@ impl Roamer {
         }
     }
 
-    async fn change(&mut self, (cell, change): (NodeName, Change)) -> Result<(), NodeError> {
+    async fn change(&mut self, cell: &NodeName, change: Change) -> Result<(), NodeError> {
         match change {
-            Change::Follows => self.enter(&cell).await,
-            Change::Failed(error) => self.fail(&cell, &error).await,
+            Change::Follows => self.enter(cell).await,
+            Change::Failed(error) => self.fail(cell, &error).await,
         }
     }
 

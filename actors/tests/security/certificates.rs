@@ -31,7 +31,7 @@ async fn client_without_certificate_is_refused() {
         .ok();
     assert_ne!(answer.first(), Some(&0x20), "no CONNACK");
 
-    let anonymous = external_broker(("mqtt.ca", &cell.pki.authority.ca()), None)
+    let anonymous = external_broker("mqtt.ca", &cell.pki.authority.ca(), None)
         .unwrap()
         .client();
     let stream = TcpStream::connect(cell.address).await.unwrap();

@@ -495,13 +495,13 @@ impl<M> Iterator for Messages<M> {
                 return Some(Err(refusal));
             }
             let waited = began.elapsed();
-            let remedy = match state.is_connected() {
-                false => "no connection",
+            let remedy = if !state.is_connected() {
+                "no connection"
+            } else if self.number > 0 && self.filter.ends_with("/nodes/+") {
                 // A status is sent only when it changes.
-                true if self.number > 0 && self.filter.ends_with("/nodes/+") => {
-                    "nothing has changed since the last"
-                }
-                true => "does a node lead the cell of this name?",
+                "nothing has changed since the last"
+            } else {
+                "does a node lead the cell of this name?"
             };
             let silence = || {
                 format!(
@@ -561,9 +561,9 @@ fn micros(captured_at: SystemTime) -> Result<Timestamp, Error> {
 
 /// The parts of HOST:PORT; the port may be absent.
 fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error> {
-    let address = text.parse::<BrokerAddress>();
-    let address =
-        address.or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
+    let address = text
+        .parse::<BrokerAddress>()
+        .or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
     address.map_err(|error| Error::Invalid(error.to_string()))
 }
 

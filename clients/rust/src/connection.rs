@@ -215,9 +215,12 @@ impl ConnectionState {
                 Event::Outgoing(Outgoing::Disconnect) => return "closed".to_owned(),
                 _ => continue,
             }
-            if state.is_closing && state.client.take().is_some() {
-                // The connection was closed during the request.
-                client.try_disconnect().unwrap_or_default();
+            // The connection was closed during the request.
+            if state.is_closing
+                && state.client.take().is_some()
+                && let Err(error) = client.try_disconnect()
+            {
+                log::warn!("cannot close the connection to {}: {error}", self.at);
             }
             drop(state);
             self.changed.notify_all();

@@ -74,21 +74,20 @@ impl Tls {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let verifier =
             WebPkiServerVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
-                .build();
-        let verifier = verifier.map_err(|error| invalid(&self.ca, &error))?;
+                .build()
+                .map_err(|error| invalid(&self.ca, &error))?;
         let name = self
             .broker_name
             .clone()
             .map(ServerName::try_from)
-            .transpose();
-        let name = name.map_err(|error| {
-            Error::Invalid(format!("broker_name {:?}: {error}", self.broker_name))
-        })?;
+            .transpose()
+            .map_err(|error| {
+                Error::Invalid(format!("broker_name {:?}: {error}", self.broker_name))
+            })?;
         let verifier = Arc::new(NamedBroker { verifier, name });
-        let builder =
-            ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
-        let builder = builder.map_err(|error| Error::Invalid(error.to_string()))?;
-        let builder = builder
+        let builder = ClientConfig::builder_with_provider(provider)
+            .with_safe_default_protocol_versions()
+            .map_err(|error| Error::Invalid(error.to_string()))?
             .dangerous()
             .with_custom_certificate_verifier(verifier);
         let Some((certificate, key)) = &self.identity else {

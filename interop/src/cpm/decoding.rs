@@ -56,10 +56,10 @@ pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, Cp
     for container in &message.payload.cpm_containers.0.0 {
         if container.container_id == pdu::PERCEIVED_OBJECT_CONTAINER {
             let container: PerceivedObjectContainer = uper(container.container_data.as_bytes())?;
-            let container = container.perceived_objects.0;
-            all += container.len();
+            let listed = container.perceived_objects.0;
+            all += listed.len();
             objects.extend(
-                container
+                listed
                     .iter()
                     .filter_map(|object| perceived(object, &frame, position_error)),
             );

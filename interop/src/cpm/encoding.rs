@@ -75,10 +75,10 @@ pub fn encode_map(
                 CpmObject::now(object),
             ))
         });
-    let all = objects
+    let all: Vec<_> = objects
         .chain(at_places)
-        .filter(|(_, source)| !cell.vacancy_signs.contains(source.object.label));
-    let all: Vec<_> = all.collect();
+        .filter(|(_, source)| !cell.vacancy_signs.contains(source.object.label))
+        .collect();
     let numbers = ids.assign(&all.iter().map(|(id, _)| *id).collect::<Vec<_>>());
     let numbered = all.into_iter().map(|(id, source)| CpmObject {
         number: numbers.get(&id).copied(),
@@ -92,7 +92,7 @@ pub fn encode_map(
         station_id,
         map.fused_at_us,
         &frame,
-        (pdu::ORIGINATING_RSU_CONTAINER, rsu),
+        container(pdu::ORIGINATING_RSU_CONTAINER, rsu),
         sources,
     )
 }
@@ -134,9 +134,9 @@ pub fn encode_report(
                 None,
                 None,
             );
-            (pdu::ORIGINATING_VEHICLE_CONTAINER, uper(&vehicle)?)
+            container(pdu::ORIGINATING_VEHICLE_CONTAINER, uper(&vehicle)?)
         }
-        None => (
+        None => container(
             pdu::ORIGINATING_RSU_CONTAINER,
             uper(&OriginatingRsuContainer::new(None))?,
         ),
@@ -281,7 +281,7 @@ fn encode(
     station_id: u32,
     time: Timestamp,
     frame: &MessageFrame,
-    station: (pdu::CpmContainerId, Vec<u8>),
+    station: pdu::WrappedCpmContainer,
     mut sources: Vec<CpmObject<'_>>,
 ) -> Result<EncodedCpm, CpmError> {
     let reference_time = (time.micros() / 1000)
@@ -300,11 +300,8 @@ fn encode(
         number,
         PerceivedObjects(objects),
     ))?;
-    let containers = [station, (pdu::PERCEIVED_OBJECT_CONTAINER, objects)];
-    let containers =
-        containers.map(|(id, bytes)| pdu::WrappedCpmContainer::new(id, Any::new(bytes)));
-    let containers =
-        pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(containers.into()));
+    let containers = vec![station, container(pdu::PERCEIVED_OBJECT_CONTAINER, objects)];
+    let constrained = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(containers));
     let position = frame.reference_position();
     let management =
         pdu::ManagementContainer::new(cdd::TimestampIts(reference_time), position, None, None);
@@ -313,12 +310,19 @@ fn encode(
         message_id: cdd::MessageId(MESSAGE_ID),
         station_id: cdd::StationId(station_id),
     };
-    let message =
-        pdu::CollectivePerceptionMessage::new(header, pdu::CpmPayload::new(management, containers));
+    let message = pdu::CollectivePerceptionMessage::new(
+        header,
+        pdu::CpmPayload::new(management, constrained),
+    );
     Ok(EncodedCpm {
         bytes: uper(&message)?,
         left_out,
     })
+}
+
+/// A container of a message, from its encoded content.
+fn container(id: pdu::CpmContainerId, content: Vec<u8>) -> pdu::WrappedCpmContainer {
+    pdu::WrappedCpmContainer::new(id, Any::new(content))
 }
 
 fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {

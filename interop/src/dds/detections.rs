@@ -338,8 +338,9 @@ pub(super) fn place_in_pictures(
         if !(0.0..=f64::from(intrinsics.width)).contains(&x) || !(0.0..=f64::from(intrinsics.height)).contains(&y) {
             return Err(InputRefusal::NoPosition("outside").with(of_box(&"of pictures of another size?")));
         }
-        let placed = projection.place(&detection, projection.cut(&detection), None::<&Point3<f64>>, &pose);
-        let placed = placed.map_err(|error| InputRefusal::NoPosition(error.as_str()).with(of_box(&error)))?;
+        let placed = projection
+            .place(&detection, projection.cut(&detection), None::<&Point3<f64>>, &pose)
+            .map_err(|error| InputRefusal::NoPosition(error.as_str()).with(of_box(&error)))?;
         Ok(PerceivedObject { scores, ..placed })
     });
     Ok(camera.frame(captured_at, Some(pose), objects))

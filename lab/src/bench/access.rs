@@ -3,8 +3,8 @@
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::transport::mqtt::{BrokerAddress, Security};
 use rumqttc::{
-    AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, QoS, SubscribeFilter,
-    TlsConfiguration, Transport,
+    AsyncClient, ConnectionError, Event, EventLoop, MqttOptions, NetworkOptions, Packet, QoS,
+    SubscribeFilter, TlsConfiguration, Transport,
 };
 
 /// Address of a broker with the credentials that it and its cell require from clients: TLS, user
@@ -85,10 +85,8 @@ impl BrokerAccess {
         &self,
         client_id: &str,
         topics: &[&str],
-    ) -> Result<(AsyncClient, EventLoop), rumqttc::ConnectionError> {
-        let trust = self.security.tls(&self.broker);
-        let trust =
-            trust.map_err(|error| rumqttc::ConnectionError::Io(std::io::Error::other(error)))?;
+    ) -> Result<(AsyncClient, EventLoop), ConnectionError> {
+        let trust = self.security.tls(&self.broker).map_err(unconnected)?;
         // The parser of names takes no brackets.
         let host = if trust.is_some() {
             self.broker.host().trim_matches(['[', ']'])
@@ -115,13 +113,18 @@ impl BrokerAccess {
                     let filters = topics
                         .iter()
                         .map(|topic| SubscribeFilter::new((*topic).to_owned(), QoS::AtMostOnce));
-                    client.try_subscribe_many(filters).unwrap_or_default();
+                    client.try_subscribe_many(filters).map_err(unconnected)?;
                 }
                 Event::Incoming(Packet::SubAck(_)) => return Ok((client, events)),
                 _ => {}
             }
         }
     }
+}
+
+/// The error of a connection that fails on this machine's side.
+fn unconnected(error: impl std::error::Error + Send + Sync + 'static) -> ConnectionError {
+    ConnectionError::Io(std::io::Error::other(error))
 }
 
 /// Maps of a thousand vehicles go through.

@@ -366,10 +366,9 @@ fn behind_node(map_log: &Path, at_door: &DoorWatcher) -> anyhow::Result<Latencie
     let at_door = at_door.maps();
     let text = fs::read_to_string(map_log)
         .with_context(|| format!("cannot read {}", map_log.display()))?;
-    let received = text
+    let received: HashMap<_, _> = text
         .lines()
-        .filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
-    let received: HashMap<_, _> = received
+        .filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok())
         .map(|map| ((map.map.epoch, map.map.round), map.received_at))
         .collect();
     let delay = |DoorArrival {

@@ -58,10 +58,14 @@ impl Echo {
             let filters = [&*format!("{OUT}/+"), BACK];
             let (client, mut events) = match access.subscribed("ecod-bench-echo", &filters).await {
                 Ok(connected) => connected,
-                Err(error) => return ready.send(Err(error)).unwrap_or_default(),
+                Err(error) => {
+                    // The caller may have given up.
+                    let _ = ready.send(Err(error));
+                    return;
+                }
             };
             // The caller may have given up.
-            ready.send(Ok(())).unwrap_or_default();
+            let _ = ready.send(Ok(()));
             let mut arrived = BTreeMap::<u32, usize>::new();
             while let Ok(event) = events.poll().await {
                 let Event::Incoming(Packet::Publish(publish)) = event else {
@@ -78,9 +82,7 @@ impl Echo {
                     for bytes in answer_bytes.all().into_iter().take(1 + usize::from(votes)) {
                         let answer = stamped(tick, vec![0; bytes]);
                         // A refusal shows as a missing answer.
-                        client
-                            .try_publish(BACK, QoS::AtMostOnce, false, answer)
-                            .unwrap_or_default();
+                        let _ = client.try_publish(BACK, QoS::AtMostOnce, false, answer);
                     }
                 }
             }

@@ -66,19 +66,18 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
         has_map: watch::Sender::new(false),
     });
     let at_broker = || format!("broker {}", target.access.broker);
-    let _echo = match load.bare {
-        true => {
-            let packets = load.vehicles * (1 + usize::from(load.votes));
-            let echo = Echo::start(
-                target.access.clone(),
-                packets,
-                Arc::clone(&answer_bytes),
-                load.votes,
-            )
-            .await;
-            Some(echo.with_context(at_broker)?)
-        }
-        false => None,
+    let _echo = if load.bare {
+        let packets = load.vehicles * (1 + usize::from(load.votes));
+        let echo = Echo::start(
+            target.access.clone(),
+            packets,
+            Arc::clone(&answer_bytes),
+            load.votes,
+        )
+        .await;
+        Some(echo.with_context(at_broker)?)
+    } else {
+        None
     };
     let mut vehicles = Vec::new();
     let mut senders = Vec::new();

@@ -191,10 +191,12 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
 impl BenchArguments {
     /// Section of the figures.
     fn section(&self) -> &'static str {
-        match (self.costs, self.doors) {
-            (true, _) => "costs",
-            (_, true) => "doors",
-            _ => "cell",
+        if self.costs {
+            "costs"
+        } else if self.doors {
+            "doors"
+        } else {
+            "cell"
         }
     }
 

@@ -64,11 +64,11 @@ pub(super) struct DemoArguments {
 }
 
 pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
-    let testbed = match &arguments.scenes {
+    let loaded = match &arguments.scenes {
         Some(file) => read(file),
         None => Testbed::from_json(RECORDED).context("the scenes of this program"),
     };
-    let testbed = testbed.map_err(Failure::usage)?;
+    let testbed = loaded.map_err(Failure::usage)?;
     let (with_street, lots) = match (&arguments.scenes, arguments.scene.as_deref()) {
         (None, None) => (true, testbed.scenes.iter().take(1).collect()),
         (None, Some(STREET)) => (true, Vec::new()),
@@ -165,8 +165,10 @@ impl Show<'_> {
             "{name}: starting {} processes\n",
             scene.cavs.len() + 1
         ))?;
-        let outcome = self.runtime.block_on(until_signalled(demo.run(tell)));
-        let outcome = outcome.with_context(|| format!("scene {name}"))?;
+        let outcome = self
+            .runtime
+            .block_on(until_signalled(demo.run(tell)))
+            .with_context(|| format!("scene {name}"))?;
         print(&format!(
             "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
             outcome.maps,
@@ -236,8 +238,10 @@ fn street_table(street: &StreetResult) -> String {
             known.known, known.precision_pct, known.recall_pct
         )
     };
-    let rows = street.alone.iter().zip(street.with_cell.values());
-    let rows = rows
+    let rows = street
+        .alone
+        .iter()
+        .zip(street.with_cell.values())
         .map(|((node, alone), cell)| format!("{node:<8}{}   {}\n", columns(alone), columns(cell)));
     let hidden = street.seen_only_by.iter().map(|(node, people)| {
         format!("people who were seen only by {node} for a while: {people}\n")

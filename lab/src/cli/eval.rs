@@ -160,9 +160,9 @@ fn evaluate(arguments: &EvalArguments, input: &Path) -> Result<Evaluated, Failur
     if let Some(format) = arguments.format {
         return tracks::evaluate_files(arguments, format, input);
     }
-    let text =
-        bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()));
-    let text = text.map_err(Failure::usage)?;
+    let text = bounded_file::read_text(path)
+        .with_context(|| format!("cannot read {}", path.display()))
+        .map_err(Failure::usage)?;
     if TrackTruth::is_in(&text) {
         return tracks::evaluate(arguments, &text, input);
     }

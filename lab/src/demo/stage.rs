@@ -218,8 +218,9 @@ async fn watch(
     while collector.reporters() < vehicles || collector.leader().as_ref() != Some(edge) {
         if clock::now().since(started) > START_TIMEOUT {
             let reporters = collector.reporters();
-            let leader = collector.leader();
-            let leader = leader.map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
+            let leader = collector
+                .leader()
+                .map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
             bail!(
                 "after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads"
             );

@@ -335,13 +335,13 @@ impl Judge<'_> {
                 .filter(|object| object.confidence >= DEFAULT_THRESHOLD)
             {
                 let place = Point2::new(object.x_m, object.y_m);
-                let near = truth.iter().filter(|known| {
-                    known.label == object.label && known.label.as_str() == "person"
-                });
-                let near =
-                    near.map(|known| (nalgebra::distance(&known.position, &place), known.id));
-                let nearest = near.filter(|(distance_m, _)| *distance_m <= MATCH_DISTANCE_M / 2.0);
-                let nearest = nearest.min_by(|a, b| a.0.total_cmp(&b.0));
+                let near = truth
+                    .iter()
+                    .filter(|known| known.label == object.label && known.label.as_str() == "person")
+                    .map(|known| (nalgebra::distance(&known.position, &place), known.id));
+                let nearest = near
+                    .filter(|(distance_m, _)| *distance_m <= MATCH_DISTANCE_M / 2.0)
+                    .min_by(|a, b| a.0.total_cmp(&b.0));
                 if let ([node], Some((_, id))) = (object.contributors.as_slice(), nearest) {
                     seen_only_by.entry(node.clone()).or_default().insert(id);
                 }

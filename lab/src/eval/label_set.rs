@@ -446,8 +446,12 @@ impl<'a> Table<'a> {
             .trim(csv::Trim::All)
             .flexible(true)
             .from_reader(text.as_bytes());
-        let header = reader.headers().map_err(unreadable)?;
-        let header = header.iter().map(str::to_lowercase).collect();
+        let header = reader
+            .headers()
+            .map_err(unreadable)?
+            .iter()
+            .map(str::to_lowercase)
+            .collect();
         Ok(Self {
             header,
             reader,

@@ -238,8 +238,12 @@ fn at_threshold(frames: &[ScoredFrame], threshold: f64) -> ThresholdScores {
 /// The first names of a set, in quotes.
 fn listed(labels: &BTreeSet<&Label>) -> String {
     const SHOWN: usize = 5;
-    let names = labels.iter().take(SHOWN).map(|label| format!("{label:?}"));
-    let names = names.collect::<Vec<_>>().join(", ");
+    let names = labels
+        .iter()
+        .take(SHOWN)
+        .map(|label| format!("{label:?}"))
+        .collect::<Vec<_>>()
+        .join(", ");
     match labels.len().saturating_sub(SHOWN) {
         0 => names,
         more => format!("{names} and {more} more"),
@@ -277,8 +281,11 @@ impl TrackEvaluation {
     /// Processes the next map.
     pub fn map(&mut self, map: &GlobalMap) {
         let ids = &mut self.ids;
-        let said = map.objects.iter().map(|object| SaidObject::of(object, ids));
-        let said: Vec<SaidObject> = said.collect();
+        let said: Vec<SaidObject> = map
+            .objects
+            .iter()
+            .map(|object| SaidObject::of(object, ids))
+            .collect();
         self.said(map.fused_at_us, &said);
     }
 
@@ -303,11 +310,18 @@ impl TrackEvaluation {
     /// The classes of the reported objects and of the truth, if both have some, but not one in
     /// common.
     pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
-        let said = self.maps.iter().flatten().flat_map(|(_, said)| said);
-        let said: BTreeSet<&Label> = said.map(|object| &object.label).collect();
+        let said: BTreeSet<&Label> = self
+            .maps
+            .iter()
+            .flatten()
+            .flat_map(|(_, said)| said)
+            .map(|object| &object.label)
+            .collect();
         let frames = self.truth.frames().iter();
-        let truth = frames.flat_map(|frame| &frame.objects);
-        let truth: BTreeSet<&Label> = truth.map(|object| &object.label).collect();
+        let truth: BTreeSet<&Label> = frames
+            .flat_map(|frame| &frame.objects)
+            .map(|object| &object.label)
+            .collect();
         let are_apart = !said.is_empty() && !truth.is_empty() && said.is_disjoint(&truth);
         are_apart.then(|| (listed(&said), listed(&truth)))
     }

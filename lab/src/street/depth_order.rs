@@ -29,15 +29,25 @@ fn is_nearer(eye: &Point2<f64>, a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> O
     parted_by_a.or_else(|| parting_side(b, a).map(|side| is_beyond(side, eye)))
 }
 
+/// A side of a footprint, counter-clockwise.
+#[derive(Debug, Clone, Copy)]
+struct Side {
+    from: Point2<f64>,
+    to: Point2<f64>,
+}
+
 /// The first side of `a` that has all of `b` beyond it.
-fn parting_side(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<(Point2<f64>, Point2<f64>)> {
-    let mut sides = (0..4).map(|corner| (a[corner], a[(corner + 1) % 4]));
+fn parting_side(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<Side> {
+    let mut sides = (0..4).map(|corner| Side {
+        from: a[corner],
+        to: a[(corner + 1) % 4],
+    });
     sides.find(|side| b.iter().all(|point| is_beyond(*side, point)))
 }
 
 /// True if a point is to the right of a side, outside of the footprint.
-fn is_beyond((from, to): (Point2<f64>, Point2<f64>), point: &Point2<f64>) -> bool {
-    (to - from).perp(&(point - from)) <= 0.0
+fn is_beyond(side: Side, point: &Point2<f64>) -> bool {
+    (side.to - side.from).perp(&(point - side.from)) <= 0.0
 }
 
 fn middle(corners: &[Point2<f64>; 4]) -> Point2<f64> {

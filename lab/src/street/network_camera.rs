@@ -179,6 +179,7 @@ async fn serve(listener: TcpListener, pictures: watch::Receiver<Jpeg>) {
 async fn send(mut client: TcpStream, mut pictures: watch::Receiver<Jpeg>) -> std::io::Result<()> {
     client.set_nodelay(true)?;
     let mut request = [0; 1024];
+    // The content of the request makes no difference.
     let _ = client.read(&mut request).await?;
     client
         .write_all(

@@ -279,8 +279,8 @@ fn fuse(
         .iter()
         .for_each(|report| evaluation.report(ReportKind::VoteDetections, report));
     let EvalResult { pace, vote } = evaluation.result();
-    let scores = if algorithms.pace() { pace } else { vote };
-    let scores = scores.ok_or_else(|| anyhow::anyhow!("no report, and nothing fused"))?;
+    let chosen = if algorithms.pace() { pace } else { vote };
+    let scores = chosen.ok_or_else(|| anyhow::anyhow!("no report, and nothing fused"))?;
     Ok((fused, scores))
 }
 

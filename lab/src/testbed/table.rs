@@ -33,6 +33,7 @@ pub fn table(results: &[SceneResult]) -> String {
             } else {
                 (padding, 0)
             };
+            // Writing to a text does not fail.
             let _ = write!(text, "{:before$}{cell}{:after$}  ", "", "");
         }
         text.truncate(text.trim_end().len());
@@ -55,10 +56,11 @@ pub fn table(results: &[SceneResult]) -> String {
             ("VOTE alone", result.vote_accuracy_pct),
             ("PACE and VOTE together", result.answer_accuracy_pct),
         ];
-        let kinds = kinds
+        let of_kinds = kinds
             .into_iter()
             .filter_map(|(kind, pct)| Some(format!("{kind} {:.2}", pct?)));
-        let all: Vec<_> = alone.chain(kinds).collect();
+        let all: Vec<_> = alone.chain(of_kinds).collect();
+        // Writing to a text does not fail.
         let _ = writeln!(
             text,
             "{}, right % by each alone: {}",

@@ -20,8 +20,12 @@ const CLEARING_S: f64 = 2.0;
 /// East, north, west or south, as quarter turns counter-clockwise from east.
 pub(super) type Direction = usize;
 
-/// A crossing, by column and row.
-pub(super) type Crossing = (usize, usize);
+/// A crossing, by its place in the grid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Crossing {
+    column: usize,
+    row: usize,
+}
 
 /// A stretch that vehicles drive on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,7 +63,8 @@ fn right_of(direction: Direction) -> Vector2<f64> {
 
 impl Roads {
     /// The crossing that a lane leads to, `None` off the grid.
-    pub(super) fn next(&self, (column, row): Crossing, heading: Direction) -> Option<Crossing> {
+    pub(super) fn next(&self, from: Crossing, heading: Direction) -> Option<Crossing> {
+        let Crossing { column, row } = from;
         let step = |at: usize, forward: bool| {
             if forward {
                 Some(at + 1).filter(|at| *at < self.count)
@@ -67,17 +72,18 @@ impl Roads {
                 at.checked_sub(1)
             }
         };
-        match heading % 4 {
-            0 => Some((step(column, true)?, row)),
-            1 => Some((column, step(row, true)?)),
-            2 => Some((step(column, false)?, row)),
-            _ => Some((column, step(row, false)?)),
-        }
+        let (column, row) = match heading % 4 {
+            0 => (step(column, true)?, row),
+            1 => (column, step(row, true)?),
+            2 => (step(column, false)?, row),
+            _ => (column, step(row, false)?),
+        };
+        Some(Crossing { column, row })
     }
 
     pub(super) fn lanes(&self) -> Vec<Path> {
-        let crossings =
-            (0..self.count).flat_map(|column| (0..self.count).map(move |row| (column, row)));
+        let crossings = (0..self.count)
+            .flat_map(|column| (0..self.count).map(move |row| Crossing { column, row }));
         let lanes = crossings.flat_map(|from| (0..4).map(move |heading| (from, heading)));
         lanes
             .filter(|(from, heading)| self.next(*from, *heading).is_some())
@@ -85,8 +91,11 @@ impl Roads {
             .collect()
     }
 
-    fn center(&self, (column, row): Crossing) -> Point2<f64> {
-        Point2::new(column as f64 * self.block_m, row as f64 * self.block_m)
+    fn center(&self, crossing: Crossing) -> Point2<f64> {
+        Point2::new(
+            crossing.column as f64 * self.block_m,
+            crossing.row as f64 * self.block_m,
+        )
     }
 
     /// Length in metres.
@@ -148,19 +157,20 @@ impl Roads {
     /// crossing first.
     pub(super) fn post(&self, number: usize) -> (Point2<f64>, f64) {
         let crossings = self.count * self.count;
-        let crossing = (number / 4 + crossings / 2 + self.count / 2) % crossings;
+        let place = (number / 4 + crossings / 2 + self.count / 2) % crossings;
+        let crossing = Crossing {
+            column: place % self.count,
+            row: place / self.count,
+        };
         let corner = number % 4;
         let out = (unit(corner) + unit(corner + 1)) * POST_M;
-        (
-            self.center((crossing % self.count, crossing / self.count)) + out,
-            (-out.y).atan2(-out.x),
-        )
+        (self.center(crossing) + out, (-out.y).atan2(-out.x))
     }
 
     /// True if the signal lets this direction go.
-    pub(super) fn is_green(&self, (column, row): Crossing, heading: Direction, at_s: f64) -> bool {
+    pub(super) fn is_green(&self, crossing: Crossing, heading: Direction, at_s: f64) -> bool {
         let cycle_s = 2.0 * (GREEN_S + CLEARING_S);
-        let offset_s = (column * 7 + row * 5) as f64;
+        let offset_s = (crossing.column * 7 + crossing.row * 5) as f64;
         let phase_s = (at_s + offset_s + (heading % 2) as f64 * cycle_s / 2.0) % cycle_s;
         phase_s < GREEN_S
     }

@@ -139,6 +139,7 @@ impl Drop for Cluster {
         for server in &mut self.servers {
             // A stopped one ends by this signal, too.
             let _ = server.child.kill();
+            // Waited for so that it leaves no zombie; its status makes no difference.
             let _ = server.child.wait();
         }
     }

@@ -142,6 +142,7 @@ impl SimulatedCell {
         }
         let template = MapTemplate::new(&self.map(TEMPLATE_ROUND, TEMPLATE_TIME));
         let present = encode(&status(NodeState::Aggregating), Encoding::Json);
+        // A new connection has room for its first message.
         let _ = client.try_publish(
             topic(RegionTopicKind::Status),
             QoS::AtMostOnce,

@@ -121,6 +121,7 @@ impl Drop for RealCells {
             drop(node.stdin.take());
         }
         for node in &mut self.nodes {
+            // Its status makes no difference at the end.
             let _ = node.wait();
         }
     }
@@ -202,6 +203,7 @@ async fn drive(broker: SocketAddr, cell: NodeName) {
             frame_yaw_rate_radps: None,
             moving: None,
         };
+        // A report that the connection does not take is lost, as on a slow link.
         let _ = client.try_publish(
             &topic,
             QoS::AtMostOnce,

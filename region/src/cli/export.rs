@@ -64,11 +64,10 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
     state.ask([arguments.tile].into());
     // A failure leaves the file of an earlier export alone.
     let unfinished = arguments.out.with_added_extension("unfinished");
-    let log = match format {
+    let log = RefCell::new(match format {
         ExportFormat::Mcap => Some(CellMapLog::create(&unfinished)?),
         ExportFormat::GeoJson => None,
-    };
-    let log = RefCell::new(log);
+    });
     let failed = RefCell::new(None);
     let write = |reading: &Reading<'_>| {
         if let (Some(log), Ok(Accepted::Map(..))) = (log.borrow_mut().as_mut(), &reading.outcome)
@@ -94,13 +93,14 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
             let (cells, maps) = log.finish()?;
             format!("{cells} cells, {maps} maps")
         }
-        None => write_geojson((arguments.tile, &unfinished), &state, clock::now())?,
+        None => write_geojson(arguments.tile, &unfinished, &state, clock::now())?,
     };
     let link = state.link();
     let trouble = link.trouble.or_else(|| {
         (link.logins == 0).then(|| "the broker has not answered; give it more --seconds".into())
     });
     if let (Some(trouble), 0) = (trouble, state.town().counts().maps) {
+        // The next export overwrites a file that stays.
         let _ = std::fs::remove_file(&unfinished);
         return Err(anyhow!("{trouble}").into());
     }
@@ -111,7 +111,8 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
 }
 
 fn write_geojson(
-    (tile, path): (Quadkey, &Path),
+    tile: Quadkey,
+    path: &Path,
     state: &RegionState,
     now: Timestamp,
 ) -> anyhow::Result<String> {

@@ -55,8 +55,8 @@ pub(super) fn run(arguments: &ServeArguments) -> Result<(), Failure> {
             config.token.as_ref(),
             arguments.watch.clone(),
             Arc::clone(&state),
-        );
-        let page = page.await?;
+        )
+        .await?;
         tracing::info!(url = %format_args!("http://{}/", page.address()), "page serves");
         tokio::join!(reader::read(&login, &state, |_| ()), page.serve());
         Ok(())

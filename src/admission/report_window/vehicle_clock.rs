@@ -144,10 +144,10 @@ impl VehicleClock {
                 (TimeBase::Cell, Some(bounds.cell_offset)),
                 (TimeBase::CellBefore, offset_before),
             ];
-            let mut scales = scales
+            let scale = scales
                 .into_iter()
-                .filter_map(|(base, offset)| Some((base, offset?)));
-            let scale = scales.find(|(_, offset)| is_age(*offset));
+                .filter_map(|(base, offset)| Some((base, offset?)))
+                .find(|(_, offset)| is_age(*offset));
             if let Some((base, offset)) = scale.filter(|_| i64::from(error) <= bounds.tolerance) {
                 return self.admit_in_cell_time(report, received_at, base, offset);
             }
@@ -272,12 +272,12 @@ impl VehicleClock {
     ) -> Result<(), RejectReason> {
         self.remember(report)?;
         let goes_back = self.last_seq.is_some_and(|last| report.seq < last);
-        self.back_and_forth = match goes_back {
-            true => self
-                .back_and_forth
+        self.back_and_forth = if goes_back {
+            self.back_and_forth
                 .saturating_add(4)
-                .min(2 * MIN_BACK_AND_FORTH),
-            false => self.back_and_forth.saturating_sub(1),
+                .min(2 * MIN_BACK_AND_FORTH)
+        } else {
+            self.back_and_forth.saturating_sub(1)
         };
         self.last_captured = report.captured_at_us;
         self.last_seq = Some(report.seq);

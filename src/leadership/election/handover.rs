@@ -28,8 +28,7 @@ impl Election {
         let out_of_reach = |name: &NodeName| self.is_out_of_reach(name, now);
         let challenger = self
             .peers
-            .challenger(ours, self.config.stable(), out_of_reach, now);
-        let challenger = challenger
+            .challenger(ours, self.config.stable(), out_of_reach, now)
             .filter(|(_, from)| now >= *from)
             .map(|(to, _)| to);
         let Some(to) = challenger.or_else(|| self.relief(now)) else {

@@ -132,8 +132,13 @@ impl Election {
         let State::Following(following) = &self.state else {
             return;
         };
-        let near = following.successors.iter().filter(|name| **name != self.id);
-        let near: Vec<_> = near.chain([&following.epoch.leader]).cloned().collect();
+        let near: Vec<_> = following
+            .successors
+            .iter()
+            .filter(|name| **name != self.id)
+            .chain([&following.epoch.leader])
+            .cloned()
+            .collect();
         let ask = self.questions.ask_for_itself(now);
         for peer in near {
             self.send(&peer, Body::Ask { ask }, now);

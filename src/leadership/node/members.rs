@@ -81,8 +81,8 @@ impl Members {
         let departed = self
             .departed
             .iter()
-            .filter(|(name, (_, until))| now < *until && !self.living.contains_key(*name));
-        let departed = departed.map(|(name, (broker, _))| (name, broker));
+            .filter(|(name, (_, until))| now < *until && !self.living.contains_key(*name))
+            .map(|(name, (broker, _))| (name, broker));
         living
             .chain(departed)
             .filter(|(_, at)| *at == broker)

@@ -144,15 +144,14 @@ impl StalenessFilter {
         let known = self
             .delays
             .iter()
-            .position(|(of, _)| of.leader == epoch.leader);
-        let known = known
+            .position(|(of, _)| of.leader == epoch.leader)
             .map(|at| self.delays.remove(at))
             .filter(|(of, delay)| {
                 // A clock that was set while another node led provides no information about the
                 // delay.
                 of == epoch || delay.distance(fused_at, received_at) <= LEADER_DELAY_MEMORY
-            });
-        let known = known.map(|(_, delay)| delay);
+            })
+            .map(|(_, delay)| delay);
         let has_waited = self
             .resumed_at
             .is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);

@@ -26,8 +26,8 @@ pub(super) fn line_of_sight(
     let on_ground = || ground::from_foot(&foot, half, projection);
     let estimate = match (cut.lower, cut.upper, size) {
         (false, false, Some(size)) => {
-            let upright = box_height::upright(&foot, &head, size, half);
-            let upright = upright.ok_or_else(|| ProjectionError::DegenerateBox(label.clone()))?;
+            let upright = box_height::upright(&foot, &head, size, half)
+                .ok_or_else(|| ProjectionError::DegenerateBox(label.clone()))?;
             on_ground()
                 .and_then(|grounded| grounded.combined_with(&upright))
                 .unwrap_or(upright)

@@ -122,7 +122,7 @@ pub fn fit_mount(
         intrinsics: *intrinsics,
         mount: *mount,
     };
-    let (start, grown, _) = fit.improved((fit.start(), vec![1.0; fit.people]), |off| {
+    let (start, grown, _) = fit.improved(fit.start(), vec![1.0; fit.people], |off| {
         (FREEDOM + 1.0) / (FREEDOM + off * off)
     });
     // Errors beyond a few medians are not counted.
@@ -136,9 +136,8 @@ pub fn fit_mount(
     let scale = off
         .get(off.len() / 2)
         .map_or(1.0, |median| (median * NORMAL_MEDIAN).max(MIN_SCALE));
-    let (found, _, covariance) = fit.improved((start, grown), |off| {
-        (-(off / scale / WELSCH).powi(2)).exp()
-    });
+    let (found, _, covariance) =
+        fit.improved(start, grown, |off| (-(off / scale / WELSCH).powi(2)).exp());
     let covariance = covariance * (scale * scale);
     let model = Vector3::new(MODEL_TILT_RAD, MODEL_TILT_RAD, MODEL_HEIGHT);
     let variance = covariance.diagonal() + model.component_mul(&model);
@@ -327,11 +326,12 @@ impl HeightFit {
         self.boxes.iter().map(error).collect()
     }
 
-    /// The likeliest values near `start` with their covariance: iteratively reweighted least
-    /// squares, from which the heights of the people are eliminated (Schur complement).
+    /// The likeliest values near `at` and `grown` with their covariance: iteratively reweighted
+    /// least squares, from which the heights of the people are eliminated (Schur complement).
     fn improved(
         &self,
-        (mut at, mut grown): (Vector3<f64>, Vec<f64>),
+        mut at: Vector3<f64>,
+        mut grown: Vec<f64>,
         weight: impl Fn(f64) -> f64,
     ) -> (Vector3<f64>, Vec<f64>, Matrix3<f64>) {
         let mut covariance = Matrix3::from_element(f64::INFINITY);

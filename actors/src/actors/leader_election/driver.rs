@@ -486,10 +486,10 @@ fn missing_words(absence: Duration, wall: Timestamp) -> String {
     let last_seen = wall - absence;
     let at = i64::try_from(last_seen.micros())
         .ok()
-        .and_then(DateTime::from_timestamp_micros);
-    let at = at.map_or_else(String::new, |at| {
-        at.format(", last seen %Y-%m-%d %H:%M:%S UTC").to_string()
-    });
+        .and_then(DateTime::from_timestamp_micros)
+        .map_or_else(String::new, |at| {
+            at.format(", last seen %Y-%m-%d %H:%M:%S UTC").to_string()
+        });
     format!("gone for {}{at}", in_words(absence))
 }
 

@@ -119,8 +119,10 @@ async fn write_all(
     while terms.changed().await.is_ok() {
         let term = *terms.borrow_and_update();
         let writer = file.clone();
-        let written = tokio::task::spawn_blocking(move || writer.save(&term)).await;
-        let written = written.map_err(std::io::Error::other).flatten();
+        let written = tokio::task::spawn_blocking(move || writer.save(&term))
+            .await
+            .map_err(std::io::Error::other)
+            .flatten();
         match &written {
             Ok(()) if is_failing => {
                 tracing::info!(path = %file.path().display(), "term saved again");

@@ -90,10 +90,9 @@ impl ReputationStore {
             signed: None,
             reset_at_us: None,
         };
-        let counts = entries
+        let mut counts: Vec<_> = entries
             .into_iter()
-            .map(|entry| share(vec![entry], Vec::new()));
-        let mut counts: Vec<_> = counts
+            .map(|entry| share(vec![entry], Vec::new()))
             .chain(marks.into_iter().map(|mark| share(Vec::new(), vec![mark])))
             .collect();
         let read = counts.len() + statements.len();

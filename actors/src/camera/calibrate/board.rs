@@ -59,8 +59,7 @@ pub fn fit_board(
     let (pixels, places) = match board {
         GroundBoard::QrCode { side_mm } => {
             // A board on the ground is foreshortened along the columns.
-            let passes = [(1.0, 1.0), (1.0, 2.0), (2.0, 4.0)];
-            let passes = passes
+            let passes = [(1.0, 1.0), (1.0, 2.0), (2.0, 4.0)]
                 .map(|(stretch_x, stretch_y)| Pass {
                     stretch_x,
                     stretch_y,

@@ -136,7 +136,7 @@ impl CocoDetector {
             reason: first_line(reason),
         };
         // Through a buffer of ours the heap would stay larger by the whole file.
-        let net = match file {
+        let read = match file {
             Some(path) => match bounded_file::open(&path) {
                 Ok(_) => dnn::read_net_from_onnx(&path),
                 Err(source) => return Err(ModelError::Unreadable { path, source }),
@@ -145,7 +145,7 @@ impl CocoDetector {
                 BUILT_IN.ok_or(ModelError::NoWeights)?,
             )),
         };
-        let net = net.map_err(|e| unusable(e.message))?;
+        let net = read.map_err(|e| unusable(e.message))?;
         let mut detector = Self {
             config,
             net,

@@ -548,11 +548,14 @@ fn names(
             (Some(labels::read(&text)), path)
         }
         None => {
-            let names = network.metadata("names").map(labels::parse).transpose();
-            let names = names.map_err(|fault| OnnxError::BadNames {
-                path: config.model.clone(),
-                fault,
-            })?;
+            let names = network
+                .metadata("names")
+                .map(labels::parse)
+                .transpose()
+                .map_err(|fault| OnnxError::BadNames {
+                    path: config.model.clone(),
+                    fault,
+                })?;
             (names, &config.model)
         }
     };

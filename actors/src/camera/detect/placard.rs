@@ -154,8 +154,9 @@ fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, De
     let enlarged = enlarge(image, pass).map_err(opencv_error)?;
     let pixels = enlarged.data_bytes().map_err(opencv_error)?;
     let view = ImageView::from_slice(pixels, enlarged.cols(), enlarged.rows(), ImageFormat::Lum);
-    let codes = view.and_then(|view| reader.from(&view));
-    let codes = codes.map_err(|error| DetectError::Decoder(error.to_string()))?;
+    let codes = view
+        .and_then(|view| reader.from(&view))
+        .map_err(|error| DetectError::Decoder(error.to_string()))?;
     Ok(codes
         .iter()
         .filter(|code| code.is_valid())
@@ -183,8 +184,8 @@ impl Code {
             position.top_right,
             position.bottom_right,
             position.bottom_left,
-        ];
-        let corners = corners.map(|c| {
+        ]
+        .map(|c| {
             Point2::new(
                 f64::from(c.x) / pass.stretch_x,
                 f64::from(c.y) / pass.stretch_y,

@@ -65,8 +65,7 @@ impl V4l2Camera {
         }
         let offered = camera
             .formats(BufType::VIDEO_CAPTURE)
-            .map(|format| Ok(format?.pixel_format()));
-        let offered = offered
+            .map(|format| Ok(format?.pixel_format()))
             .collect::<io::Result<Vec<_>>>()
             .map_err(refused("its formats cannot be listed"))?;
         let conversion = PixelConversion::choose(&offered).ok_or_else(|| {
@@ -76,8 +75,9 @@ impl V4l2Camera {
             ))
         })?;
         let [width, height] = [0, 1].map(|side| size[side].unwrap_or(DEFAULT_SIZE[side]));
-        let camera = camera.video_capture(PixFormat::new(width, height, conversion.format()));
-        let camera = camera.map_err(refused("it refuses the format"))?;
+        let camera = camera
+            .video_capture(PixFormat::new(width, height, conversion.format()))
+            .map_err(refused("it refuses the format"))?;
         let layout = FrameLayout::new(conversion, camera.format()).map_err(failed)?;
         let fps = fps.unwrap_or(DEFAULT_FPS);
         match camera.set_frame_interval(Fract::new(1000, (fps * 1000.0).round().max(1.0) as u32)) {

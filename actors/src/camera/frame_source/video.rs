@@ -144,8 +144,8 @@ impl VideoProcess {
         if i64::from(rows) * i64::from(columns) > MAX_PIXELS {
             return Err(self.lost(format!("{columns} by {rows} pixels are too many")));
         }
-        let image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0));
-        let mut image = image.map_err(|e| self.lost(e.message))?;
+        let mut image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0))
+            .map_err(|e| self.lost(e.message))?;
         let pixels = image.data_bytes_mut().map_err(|e| self.lost(e.message))?;
         self.output
             .read_exact(pixels)
@@ -223,8 +223,8 @@ struct DeadlineReader {
 
 impl Read for DeadlineReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let left = Timespec::try_from(self.deadline.saturating_duration_since(Instant::now()));
-        let left = left.map_err(io::Error::other)?;
+        let left = Timespec::try_from(self.deadline.saturating_duration_since(Instant::now()))
+            .map_err(io::Error::other)?;
         match poll(&mut [PollFd::new(&self.stdout, PollFlags::IN)], Some(&left))? {
             0 => Err(io::ErrorKind::TimedOut.into()),
             _ => self.stdout.read(buffer),

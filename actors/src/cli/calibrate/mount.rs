@@ -215,8 +215,9 @@ impl MountArguments {
             .with_context(place)?
             .entry("mount")
             .or_insert_with(toml_edit::table)
-            .as_table_like_mut();
-        let table = table.context("`mount` is no table").with_context(place)?;
+            .as_table_like_mut()
+            .context("`mount` is no table")
+            .with_context(place)?;
         let keys = toml::Table::try_from(mount).with_context(place)?;
         for (key, number) in keys
             .iter()
@@ -255,9 +256,10 @@ impl PointsArguments {
         let (config, _, lens) = self.node.load()?;
         let mut stated = self.points.clone();
         if let Some(file) = &self.file {
-            let text = bounded_file::read_text(file);
-            let text = text.with_context(|| format!("cannot read points from {}", file.display()));
-            for (number, line) in text.map_err(Failure::usage)?.lines().enumerate() {
+            let text = bounded_file::read_text(file)
+                .with_context(|| format!("cannot read points from {}", file.display()))
+                .map_err(Failure::usage)?;
+            for (number, line) in text.lines().enumerate() {
                 if !line.trim().is_empty() && !line.trim_start().starts_with('#') {
                     let place =
                         |problem| anyhow!("{}, line {}: {problem}", file.display(), number + 1);
@@ -349,8 +351,8 @@ impl GroundBoardArguments {
         let lens = lens
             .of_frames(ImageSize::of(&photograph))
             .map_err(Failure::usage)?;
-        let fit = fit_board(&photograph, &board, &lens);
-        let fit = fit.with_context(|| format!("{} gives no mount", self.photograph.display()))?;
+        let fit = fit_board(&photograph, &board, &lens)
+            .with_context(|| format!("{} gives no mount", self.photograph.display()))?;
         let used = fit.points.iter().filter(|point| !point.is_outlier);
         let worst_px = used.clone().map(|point| point.error_px).fold(0.0, f64::max);
         eprintln!(

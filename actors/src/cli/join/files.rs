@@ -124,14 +124,18 @@ impl NodeDirectory {
         );
         let city = tls.city.as_ref().zip(welcome.city.as_ref());
         let of_city = city.iter().flat_map(|(paths, city)| {
-            let list = paths.revocation_list.as_ref();
-            let list = list.map(|path| (path.clone(), city.revocation_list.as_str(), 0o644));
+            let list = paths
+                .revocation_list
+                .as_ref()
+                .map(|path| (path.clone(), city.revocation_list.as_str(), 0o644));
             [(paths.ca.clone(), city.ca.as_str(), 0o644)]
                 .into_iter()
                 .chain(list)
         });
-        let list = tls.revocation_list.as_ref();
-        let list = list.map(|path| (path.clone(), welcome.revocation_list.as_str(), 0o644));
+        let list = tls
+            .revocation_list
+            .as_ref()
+            .map(|path| (path.clone(), welcome.revocation_list.as_str(), 0o644));
         self.put(of_city.chain(list).chain([
             (tls.ca.clone(), welcome.ca.as_str(), 0o644),
             (tls.certificate.clone(), welcome.certificate.as_str(), 0o644),

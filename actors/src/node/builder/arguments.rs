@@ -604,10 +604,11 @@ mod tests {
     use crate::transport::mqtt::Security;
 
     fn builder(config: NodeConfig) -> NodeBuilder {
-        let vehicle = (VehicleParts::new(&config), Presence::Whole);
+        let vehicle = VehicleParts::new(&config);
         let held = HeldDescription::default();
         NodeBuilder::new(
             vehicle,
+            Presence::Whole,
             config,
             Security::default(),
             held,

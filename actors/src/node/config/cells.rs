@@ -107,8 +107,7 @@ impl NodeConfig {
         let Some(path) = &self.cells else {
             return Ok(Vec::new());
         };
-        let text = bounded_file::read_text(path);
-        let text = text.map_err(|source| LoadError::Unreadable {
+        let text = bounded_file::read_text(path).map_err(|source| LoadError::Unreadable {
             path: path.clone(),
             source,
         })?;

@@ -93,7 +93,8 @@ impl LiveState {
                     |oldest: &LatestReport| received_at.since(oldest.received_at) > SILENCE;
                 insert(
                     &mut latest.reports,
-                    ((report.node.clone(), *kind), entry),
+                    (report.node.clone(), *kind),
+                    entry,
                     is_beside,
                     rank,
                     gives_way,
@@ -120,7 +121,8 @@ impl LiveState {
                     |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
                 insert(
                     &mut latest.statuses,
-                    (status.node.clone(), entry),
+                    status.node.clone(),
+                    entry,
                     is_beside,
                     rank,
                     |_| true,
@@ -301,7 +303,8 @@ fn are_parts(one: &NodeName, other: &NodeName) -> bool {
 /// unchanged.
 fn insert<K: Ord + Clone, T, R: Ord>(
     map: &mut BTreeMap<K, T>,
-    (key, value): (K, T),
+    key: K,
+    value: T,
     is_beside: impl Fn(&K) -> bool,
     rank: impl Fn(&T) -> R,
     gives_way: impl FnOnce(&T) -> bool,

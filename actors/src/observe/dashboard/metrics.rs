@@ -77,9 +77,13 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
         ready,
         i64::from(monitor.readiness().ready),
     );
-    let others = sources.members.borrow();
-    let others = others.iter().filter(|member| !member.name.is_part());
-    let members = count(others.count() + 1);
+    let others = sources
+        .members
+        .borrow()
+        .iter()
+        .filter(|member| !member.name.is_part())
+        .count();
+    let members = count(others + 1);
     gauge(
         registry,
         "members",
@@ -277,8 +281,8 @@ fn traffic(registry: &mut Registry, monitor: &NodeMonitor) {
         ("map", Event::MapAccepted),
         ("verdicts", Event::VerdictsAccepted),
         ("reputations", Event::ReputationsAccepted),
-    ];
-    let accepted = accepted.map(|(label, event)| (kind(label), sources.counters.events(event)));
+    ]
+    .map(|(label, event)| (kind(label), sources.counters.events(event)));
     counters(
         registry,
         "rounds_accepted",

@@ -291,8 +291,7 @@ impl NodeMonitor {
         let now = clock::now();
         let troubles = self.troubles();
         let newest = &sources.vitals.newest;
-        let map = newest.map.borrow().clone();
-        let map = map.map(|newest| Received {
+        let map = newest.map.borrow().clone().map(|newest| Received {
             received_at: newest.received_at,
             message: newest.map,
         });

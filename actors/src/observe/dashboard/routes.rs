@@ -173,12 +173,18 @@ struct MissingAnswer {
 async fn show_readiness(State(api): Api) -> Response {
     let readiness = api.monitor.readiness();
     let now = clock::now();
-    let missing = api.monitor.sources.live_state.expected().missing();
-    let missing = missing.into_iter().map(|node| MissingAnswer {
-        missing_s: now.since(node.last_seen).as_secs(),
-        last_seen_us: node.last_seen,
-        node: node.name,
-    });
+    let missing = api
+        .monitor
+        .sources
+        .live_state
+        .expected()
+        .missing()
+        .into_iter()
+        .map(|node| MissingAnswer {
+            missing_s: now.since(node.last_seen).as_secs(),
+            last_seen_us: node.last_seen,
+            node: node.name,
+        });
     let status = if readiness.ready {
         StatusCode::OK
     } else {

@@ -205,11 +205,13 @@ fn others(
         if members.iter().any(|member| member.name == name) {
             continue;
         }
-        let at = nodes.iter().position(|node| node.name == name);
-        let at = at.unwrap_or_else(|| {
-            nodes.push(entry(&name, role, false, None));
-            nodes.len() - 1
-        });
+        let at = nodes
+            .iter()
+            .position(|node| node.name == name)
+            .unwrap_or_else(|| {
+                nodes.push(entry(&name, role, false, None));
+                nodes.len() - 1
+            });
         if let Some(node) = nodes.get_mut(at) {
             node.missing = true;
             node.last_seen_us = Some(last_seen);

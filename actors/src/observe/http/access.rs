@@ -165,7 +165,7 @@ fn is_this_machine(host: &HeaderValue) -> bool {
     let Ok(host) = host.to_str() else {
         return false;
     };
-    let name = match host.rsplit_once(':') {
+    let without_port = match host.rsplit_once(':') {
         Some((name, port))
             if !port.is_empty() && port.bytes().all(|byte| byte.is_ascii_digit()) =>
         {
@@ -173,10 +173,10 @@ fn is_this_machine(host: &HeaderValue) -> bool {
         }
         _ => host,
     };
-    let name = name
+    let name = without_port
         .strip_prefix('[')
         .and_then(|name| name.strip_suffix(']'))
-        .unwrap_or(name);
+        .unwrap_or(without_port);
     name.eq_ignore_ascii_case("localhost")
         || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }

@@ -88,8 +88,8 @@ impl Channels {
         let server = WebSocketServer::new()
             .name("ecod-node")
             .bind(LOOPBACK, port)
-            .context(&context);
-        let server = server.start_blocking()?;
+            .context(&context)
+            .start_blocking()?;
         tracing::info!(
             port = server.port(),
             "log is served live for Foxglove and Lichtblick"
@@ -120,8 +120,9 @@ impl MessageSink for Channels {
                 let channel = ChannelBuilder::new(topic)
                     .context(&self.context)
                     .schema(schema)
-                    .message_encoding("json");
-                let channel = channel.build_raw().map_err(std::io::Error::other)?;
+                    .message_encoding("json")
+                    .build_raw()
+                    .map_err(std::io::Error::other)?;
                 self.by_topic.entry(key).or_insert(channel)
             }
         };

@@ -172,11 +172,11 @@ fn latency(report: &Report) -> String {
             &report.verdicts.fused_to_received,
         ),
     ];
-    let kinds: Vec<_> = kinds
+    let measured: Vec<_> = kinds
         .into_iter()
         .filter(|(_, values)| !values.is_empty())
         .collect();
-    let rows: Vec<_> = kinds
+    let rows: Vec<_> = measured
         .iter()
         .map(|(name, values)| quantiles(name, values))
         .collect();
@@ -193,7 +193,7 @@ fn latency(report: &Report) -> String {
         title: "latency distribution",
         x_label: "ms",
         y_label: "% within that time",
-        curves: kinds.iter().map(curves).collect(),
+        curves: measured.iter().map(curves).collect(),
         marks: Vec::new(),
         x: Axis::Logarithmic,
     };
@@ -211,18 +211,20 @@ fn gaps(report: &Report) -> String {
         ("maps", &report.maps.gaps),
         ("verdicts", &report.verdicts.gaps),
     ];
-    let kinds: Vec<_> = kinds
+    let measured: Vec<_> = kinds
         .into_iter()
         .filter(|(_, gaps)| gaps.newest().is_some())
         .collect();
-    let rows: Vec<_> = kinds
+    let rows: Vec<_> = measured
         .iter()
         .map(|(name, gaps)| quantiles(name, &gaps.values()))
         .collect();
     let curve = |&(name, gaps): &(&str, &Samples)| {
         // A gap extends from the round before to the round that ends it.
-        let points = gaps.points(start, seconds(report), SLICES).into_iter();
-        let points = points.flat_map(|(x, gap)| [(x - gap, gap * 1000.0), (x, gap * 1000.0)]);
+        let points = gaps
+            .points(start, seconds(report), SLICES)
+            .into_iter()
+            .flat_map(|(x, gap)| [(x - gap, gap * 1000.0), (x, gap * 1000.0)]);
         Curve {
             name: name.to_owned(),
             points: points.collect(),
@@ -232,7 +234,7 @@ fn gaps(report: &Report) -> String {
         report,
         "time between rounds",
         "ms since the one before",
-        kinds.iter().map(curve).collect(),
+        measured.iter().map(curve).collect(),
     );
     let text = shown(&plot) + &table(&QUANTILES, &rows);
     section(
@@ -358,8 +360,10 @@ fn over_time<'a>(
     curves: Vec<Curve>,
 ) -> Plot<'a> {
     let start = report.start();
-    let marks = report.leaders.iter().skip(1);
-    let marks = marks
+    let marks = report
+        .leaders
+        .iter()
+        .skip(1)
         .map(|run| {
             (
                 run.first_at.since(start).as_secs_f64(),

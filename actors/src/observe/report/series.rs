@@ -16,11 +16,11 @@ impl Samples {
     /// Points by seconds since `start`. Of each of `parts` time slices, only minimum and maximum
     /// remain, so that peaks survive.
     pub(super) fn points(&self, start: Timestamp, seconds: f64, parts: usize) -> Vec<(f64, f64)> {
-        let points = self
+        let points: Vec<_> = self
             .values
             .iter()
-            .map(|(at, value)| (at.since(start).as_secs_f64(), *value));
-        let points: Vec<_> = points.collect();
+            .map(|(at, value)| (at.since(start).as_secs_f64(), *value))
+            .collect();
         let slice = |x: f64| (x / seconds.max(1e-9) * parts as f64) as usize;
         points
             .chunk_by(|a, b| slice(a.0) == slice(b.0))
@@ -42,12 +42,13 @@ impl Samples {
 /// Minimum and maximum in order of time.
 fn extremes(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let by_value = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
-    let extremes = points
+    let mut extremes: Vec<_> = points
         .iter()
         .min_by(by_value)
         .into_iter()
-        .chain(points.iter().max_by(by_value));
-    let mut extremes: Vec<_> = extremes.copied().collect();
+        .chain(points.iter().max_by(by_value))
+        .copied()
+        .collect();
     extremes.sort_by(|a, b| a.0.total_cmp(&b.0));
     extremes.dedup();
     extremes

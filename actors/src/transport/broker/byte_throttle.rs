@@ -35,7 +35,8 @@ impl ByteThrottle {
         &self,
         principal: &Arc<str>,
         has_large_share: bool,
-        (bytes, packets): (usize, usize),
+        bytes: usize,
+        packets: usize,
         now: Timestamp,
     ) -> Duration {
         let mut paid_until = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -67,9 +68,8 @@ mod tests {
                 return sent;
             }
             sent += packet;
-            waits[0] = now
-                + throttle.charge(&principal, large, (packet, 1), now)
-                + Duration::from_micros(1);
+            waits[0] =
+                now + throttle.charge(&principal, large, packet, 1, now) + Duration::from_micros(1);
         }
     }
 

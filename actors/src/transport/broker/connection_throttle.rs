@@ -186,8 +186,8 @@ impl AddressTable {
 impl LoginSlot {
     /// Waits until a newer connection has evicted this one.
     pub(super) async fn evicted(&mut self) {
-        // The drop of the sender is the signal.
-        (&mut self.evicted).await.unwrap_or_default();
+        // The drop of the sender is the signal, so that the result is always an error.
+        let _ = (&mut self.evicted).await;
     }
 
     /// Frees the place: the client has logged in.

@@ -366,9 +366,8 @@ fn serve(
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
-            ready
-                .send(Err(BrokerError::Thread { address, source }))
-                .unwrap_or_default();
+            // The caller waits for the answer.
+            let _ = ready.send(Err(BrokerError::Thread { address, source }));
             return;
         }
     };
@@ -378,12 +377,13 @@ fn serve(
                 Ok(prepared) => prepared,
                 Err(error) => {
                     let reason = error.root_cause().to_string();
-                    return ready
-                        .send(Err(BrokerError::Bind { address, reason }))
-                        .unwrap_or_default();
+                    // The caller waits for the answer.
+                    let _ = ready.send(Err(BrokerError::Bind { address, reason }));
+                    return;
                 }
             };
-        ready.send(Ok(bound)).unwrap_or_default();
+        // The caller waits for the answer.
+        let _ = ready.send(Ok(bound));
         let admitting = async {
             match frontend {
                 Some(frontend) => frontend.run().await,
@@ -423,7 +423,7 @@ async fn prepare(
     SocketAddr,
     ServerContext,
 )> {
-    let listener = Builder::new()
+    let builder = Builder::new()
         .name("ecod")
         // Without it a restart would wait for the last connections' TIME_WAIT; a live listener
         // still wins.
@@ -435,20 +435,20 @@ async fn prepare(
         .session_expiry_interval(MAX_SESSION_EXPIRY)
         .max_session_expiry_interval(MAX_SESSION_EXPIRY)
         .handshake_timeout(Duration::from_secs(5));
-    let listener = match &policy {
+    let limited = match &policy {
         // With anonymous clients disabled, rmqtt calls the hooks for each login. Subscriptions are
         // limited by `SubscriptionQuota`, because rmqtt would write a line of the log for each one
         // that it refuses.
-        Some(_) => listener
+        Some(_) => builder
             .laddr((Ipv4Addr::LOCALHOST, 0).into())
             .allow_anonymous(false)
             .max_subscriptions(0),
-        None => listener
+        None => builder
             .laddr(address)
             .max_topic_levels(MAX_TOPIC_LEVELS)
             .max_subscriptions(MAX_SUBSCRIPTIONS),
     };
-    let listener = listener.bind().and_then(Listener::tcp)?;
+    let listener = limited.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;
     // rmqtt's own overload check uses the load of the whole machine, which a vehicle's camera would
     // exceed.

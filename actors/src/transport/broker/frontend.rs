@@ -251,8 +251,8 @@ impl FrontendState {
         let own = current.as_ref().zip(certificates.first());
         let identity = own
             .map(|(current, own)| current.borrow().subject_of(own))
-            .transpose();
-        let identity = identity.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
+            .transpose()
+            .map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
         let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
         let is_program = self.door.is_program(&principal, &connect.client_id);
         let principal = if is_program {
@@ -320,9 +320,8 @@ async fn secure(
         .get_ref()
         .1
         .peer_certificates()
-        .map(|chain| chain.to_vec());
-    let certificates =
-        certificates.ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
+        .map(|chain| chain.to_vec())
+        .ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
     Ok((Box::pin(stream), certificates))
 }
 

@@ -86,12 +86,11 @@ impl Permissions {
                 LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
                 LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
             };
-            match self.door.is_program(&principal, info.client_id()) {
-                true => {
-                    self.is_within_limits(topic, retain, bytes)
-                        && self.door.allows_will(&principal, topic)
-                }
-                false => self.allows(&principal, topic, retain, bytes),
+            if self.door.is_program(&principal, info.client_id()) {
+                self.is_within_limits(topic, retain, bytes)
+                    && self.door.allows_will(&principal, topic)
+            } else {
+                self.allows(&principal, topic, retain, bytes)
             }
         };
         let is_own = |identity: &Arc<CertificateSubject>| {
@@ -114,7 +113,7 @@ impl Permissions {
         if self.door.is_program(&principal, &session.id.client_id) {
             self.check_limits(topic, retain, bytes)
                 .map_err(DoorRefusal::not_permitted)?;
-            return self.door.take(&principal, (place, topic), publish);
+            return self.door.take(&principal, place, topic, publish);
         }
         if place != TopicPlace::Cell || !self.allows(&principal, topic, retain, bytes) {
             return Err(refused());

@@ -179,7 +179,8 @@ impl RelayLimits {
             let wait = self.throttle.charge(
                 source,
                 has_large_share,
-                (due - charged, packets),
+                due - charged,
+                packets,
                 clock::now(),
             );
             charged = due;

@@ -137,11 +137,10 @@ fn answer(request: &Request, mut response: Response) -> Result<Response, ErrorRe
     if let Err(reason) = check_page(request.headers()) {
         return refuse(StatusCode::FORBIDDEN, reason);
     }
-    let offered = request
+    let mut offered = request
         .headers()
         .get_all(SEC_WEBSOCKET_PROTOCOL)
-        .into_iter();
-    let mut offered = offered
+        .into_iter()
         .filter_map(|value| value.to_str().ok())
         .flat_map(|value| value.split(','))
         .map(str::trim);

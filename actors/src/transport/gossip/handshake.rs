@@ -94,9 +94,16 @@ pub(crate) struct Prover {
     notices: Notices,
 }
 
-/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's
-/// proof.
-pub(crate) type PendingKey = (SessionId, SocketAddr, Cookie);
+/// The challenge that a proof answers. The cookie is part of the key, so that a forged challenge
+/// does not replace an honest one's proof.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct PendingKey {
+    /// The challenger's session.
+    pub(crate) session: SessionId,
+    /// The challenger's address.
+    pub(crate) address: SocketAddr,
+    pub(crate) cookie: Cookie,
+}
 
 /// A proof that was sent and not yet accepted.
 pub(crate) struct PendingProof {
@@ -166,8 +173,12 @@ impl Prover {
     /// A key pair for one handshake; `None` if the system provides no random numbers.
     pub(crate) fn draw_ephemeral(&self) -> Option<(EphemeralPrivateKey, [u8; 32])> {
         let private = EphemeralPrivateKey::generate(&X25519, &self.random).ok()?;
-        let public = private.compute_public_key().ok()?;
-        let public = public.as_ref().try_into().ok()?;
+        let public = private
+            .compute_public_key()
+            .ok()?
+            .as_ref()
+            .try_into()
+            .ok()?;
         Some((private, public))
     }
 
@@ -199,7 +210,9 @@ impl Prover {
         &mut self,
         signed: &SignedMessage<'_>,
         attestation: &Attestation,
-        (name, session, from): (&NodeName, &SessionId, SocketAddr),
+        name: &NodeName,
+        session: &SessionId,
+        from: SocketAddr,
     ) -> Result<(Proven, Transcript), FrameEvent> {
         if session_of(name, &attestation.nonce) != *session {
             return Err(FrameEvent::Untrusted);
@@ -228,7 +241,8 @@ impl Prover {
     pub(crate) fn expect_accept(
         &mut self,
         key: PendingKey,
-        (private, transcript): (EphemeralPrivateKey, Transcript),
+        private: EphemeralPrivateKey,
+        transcript: Transcript,
         accepter: NodeName,
         now: Timestamp,
     ) {
@@ -249,8 +263,8 @@ impl Prover {
             let most = self
                 .pending
                 .iter()
-                .max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)));
-            let most = most.map(|(key, _)| *key);
+                .max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)))
+                .map(|(key, _)| *key);
             most.and_then(|key| self.pending.remove(&key));
         }
     }
@@ -264,7 +278,7 @@ impl Prover {
         let to = self
             .pending
             .iter()
-            .filter(|((to, at, _), _)| to == session && *at == address);
+            .filter(|(key, _)| key.session == *session && key.address == address);
         to.map(|(key, proof)| (*key, proof.transcript, proof.accepter.clone()))
             .collect()
     }
@@ -272,7 +286,7 @@ impl Prover {
     /// The ephemeral key of an accepted proof. Other proofs to the session are dropped.
     pub(crate) fn take_pending(&mut self, key: &PendingKey) -> Option<EphemeralPrivateKey> {
         let proof = self.pending.remove(key);
-        self.pending.retain(|(session, ..), _| *session != key.0);
+        self.pending.retain(|other, _| other.session != key.session);
         proof.map(|proof| proof.private)
     }
 
@@ -334,15 +348,32 @@ impl SignedMessage<'_> {
     }
 }
 
+/// What the keys of a handshake are derived from.
+pub(crate) struct KeyAgreement<'a> {
+    pub(crate) cell: &'a CellKey,
+    /// This node's ephemeral key.
+    pub(crate) private: EphemeralPrivateKey,
+    /// The other node's public ephemeral key.
+    pub(crate) theirs: &'a [u8; 32],
+    /// The accepter's transcript.
+    pub(crate) transcript: &'a Transcript,
+    /// This node's session.
+    pub(crate) own: &'a SessionId,
+    /// The other node's session.
+    pub(crate) other: &'a SessionId,
+}
+
 /// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's
 /// transcript.
-pub(crate) fn agree(
-    cell: &CellKey,
-    (private, theirs): (EphemeralPrivateKey, &[u8; 32]),
-    transcript: &Transcript,
-    (own, other): (&SessionId, &SessionId),
-    is_confirmed: bool,
-) -> Result<KeySet, FrameEvent> {
+pub(crate) fn agree(agreement: KeyAgreement<'_>, is_confirmed: bool) -> Result<KeySet, FrameEvent> {
+    let KeyAgreement {
+        cell,
+        private,
+        theirs,
+        transcript,
+        own,
+        other,
+    } = agreement;
     let theirs = UnparsedPublicKey::new(&X25519, theirs);
     let agreed = agreement::agree_ephemeral(private, &theirs, |secret| {
         let session = cell.session(secret, transcript);
@@ -357,8 +388,8 @@ pub(crate) fn agree(
     })
 }
 
-fn host_of((_, address, _): &PendingKey) -> IpAddr {
-    host_network(address.ip())
+fn host_of(key: &PendingKey) -> IpAddr {
+    host_network(key.address.ip())
 }
 
 fn proven(subject: &CertificateSubject, name: &NodeName, certificate: &[u8]) -> Proven {

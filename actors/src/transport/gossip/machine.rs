@@ -28,7 +28,7 @@ use super::handshake::Identity;
 use super::key::{CellKey, SessionNonce};
 use super::node_id::{MAX_CLAIMED_LIFE, NodeId};
 use super::notices::GossipNotice;
-use super::sessions::{Arrival, FrameContent, Sessions};
+use super::sessions::{Arrival, FrameContent, Sessions, SessionsSetup};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
 use crate::platform::throttle::TokenBucket;
@@ -129,11 +129,16 @@ impl GossipMachine {
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
             sessions: Sessions::new(
-                (cell, key),
-                (&own.name, session, identity),
-                &secret,
-                config.max_peers,
-                Arc::clone(&counters),
+                SessionsSetup {
+                    cell,
+                    key,
+                    name: &own.name,
+                    nonce: session,
+                    identity,
+                    secret: &secret,
+                    max_peers: config.max_peers,
+                    counters: Arc::clone(&counters),
+                },
                 now,
             ),
             gossip: Swim::new(own, config, proves, seed),
@@ -321,7 +326,7 @@ impl GossipMachine {
                 let greeter = answer.is_none();
                 self.outputs
                     .extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
-                self.meet(introduction, (from, speaks, greeter), at);
+                self.meet(introduction, from, speaks, greeter, at);
             }
             FrameContent::Gossip { from, body } => {
                 let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);
@@ -354,11 +359,14 @@ impl GossipMachine {
     }
 
     /// Processes the handshake of an admitted node: its claims to this node's name, then its
-    /// identity.
+    /// identity. `speaks` is true if its session is accepted for its name, `greeter` if this node
+    /// began the handshake.
     fn meet(
         &mut self,
         introduction: Introduction,
-        (from, speaks, greeter): (SocketAddr, bool, bool),
+        from: SocketAddr,
+        speaks: bool,
+        greeter: bool,
         at: Timestamp,
     ) {
         let Introduction { id, seen_at, claim } = introduction;

@@ -41,8 +41,10 @@ impl NodeId {
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
         let is_near =
             |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
-        let broker = self.broker.filter(is_near);
-        let broker = broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
+        let broker = self
+            .broker
+            .filter(is_near)
+            .map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
         Member {
             name: self.name.clone(),
             run: self.run,

@@ -61,6 +61,22 @@ pub(crate) struct Sessions {
     counters: Arc<FrameCounters>,
 }
 
+/// What a node's sessions are made from.
+pub(crate) struct SessionsSetup<'a> {
+    pub(crate) cell: NodeName,
+    pub(crate) key: CellKey,
+    /// The node's own name.
+    pub(crate) name: &'a NodeName,
+    /// The node's session itself in a cell without certificates.
+    pub(crate) nonce: SessionNonce,
+    /// The node's certificates, in a cell with certificates.
+    pub(crate) identity: Option<Identity>,
+    /// Secret from which cookies are derived.
+    pub(crate) secret: &'a [u8; 32],
+    pub(crate) max_peers: usize,
+    pub(crate) counters: Arc<FrameCounters>,
+}
+
 /// State of a name in the gossip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct KnownMember {
@@ -119,15 +135,18 @@ pub(crate) enum FrameContent {
 }
 
 impl Sessions {
-    /// No sessions. `nonce` is the node's session itself in a cell without certificates.
-    pub(crate) fn new(
-        (cell, key): (NodeName, CellKey),
-        (name, nonce, identity): (&NodeName, SessionNonce, Option<Identity>),
-        secret: &[u8; 32],
-        max_peers: usize,
-        counters: Arc<FrameCounters>,
-        now: Timestamp,
-    ) -> Self {
+    /// No sessions.
+    pub(crate) fn new(setup: SessionsSetup<'_>, now: Timestamp) -> Self {
+        let SessionsSetup {
+            cell,
+            key,
+            name,
+            nonce,
+            identity,
+            secret,
+            max_peers,
+            counters,
+        } = setup;
         let own = if identity.is_some() {
             session_of(name, &nonce)
         } else {

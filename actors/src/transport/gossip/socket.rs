@@ -47,7 +47,7 @@ impl GossipSocket {
     /// Joins the multicast group, if enabled.
     pub(crate) fn join(&self, config: &MulticastConfig) -> io::Result<()> {
         if let Some(group) = join(config, &self.own, self.address)? {
-            // It is joined once.
+            // The cell is empty, because the group is joined once.
             let _ = self.group.set(group);
         }
         Ok(())
@@ -114,8 +114,10 @@ fn open(address: SocketAddr) -> Result<std::net::UdpSocket, BindError> {
             Some(Protocol::UDP),
         )?;
         socket.set_nonblocking(true)?;
-        // The system may grant less.
-        let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES);
+        // The membership works with the system's default buffer, too.
+        if let Err(error) = socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES) {
+            tracing::debug!(%address, %error, "the size of the receive buffer stays as it is");
+        }
         socket.bind(&address.into())?;
         Ok(socket.into())
     };

@@ -130,8 +130,8 @@ impl Swim {
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
         let mut updates = body;
-        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates);
-        let header = header.map_err(|_| FrameEvent::Malformed)?;
+        let header = Codec::<NodeId>::decode_header(&mut PostcardCodec, &mut updates)
+            .map_err(|_| FrameEvent::Malformed)?;
         if header.src.name != *from {
             return Err(FrameEvent::NameMismatch);
         }
@@ -140,7 +140,7 @@ impl Swim {
         }
         let result = if self.lives.is_some() {
             let body = self
-                .without_hearsay(&header.src, (body, updates), is_heard)
+                .without_hearsay(&header.src, body, updates, is_heard)
                 .map_err(|_| FrameEvent::Malformed)?;
             self.foca.handle_data(&body, &mut self.runtime)
         } else {
@@ -152,11 +152,12 @@ impl Swim {
 
     /// Removes second-hand statements from a message: news of nodes that this node has not
     /// admitted, lives that a node has not claimed itself, and suspicions of nodes that this node
-    /// receives directly.
+    /// receives directly. `updates` is the part of `body` behind its header.
     fn without_hearsay(
         &mut self,
         from: &NodeId,
-        (body, updates): (&[u8], &[u8]),
+        body: &[u8],
+        updates: &[u8],
         is_heard: &dyn Fn(&NodeName) -> bool,
     ) -> Result<Vec<u8>, postcard::Error> {
         let Some((count, mut rest)) = updates.split_first_chunk::<2>() else {

@@ -227,9 +227,8 @@ impl Host {
         let guest = self
             .guests
             .get_mut(&request.node)
-            .filter(|guest| hash(&guest.secret) == hash(&secret));
-        let guest =
-            guest.ok_or("the token was used already, or is of another `ecod-node invite`")?;
+            .filter(|guest| hash(&guest.secret) == hash(&secret))
+            .ok_or("the token was used already, or is of another `ecod-node invite`")?;
         let signing = CertificateSigningRequestParams::from_pem(&request.request)
             .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
         let node = &request.node;

@@ -299,8 +299,10 @@ impl LinkTask {
         let mut heard_itself = false;
         loop {
             let polled = Instant::now();
-            let packet = connection.next(patience.saturating_sub(silent)).await;
-            let packet = packet.inspect_err(|_| counters.count(Event::Disconnected))?;
+            let packet = connection
+                .next(patience.saturating_sub(silent))
+                .await
+                .inspect_err(|_| counters.count(Event::Disconnected))?;
             listened += polled.elapsed().min(3 * config.connect_timeout() / 4);
             if matches!(packet, Packet::Sent) {
                 silent += polled.elapsed().min(config.keep_alive());

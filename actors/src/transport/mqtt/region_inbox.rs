@@ -55,7 +55,8 @@ impl RegionInbox {
     /// Creates an inbox for messages of the region to the cell with its origin in the tile, in this
     /// run of the node.
     pub(crate) fn new(
-        (cell, tile): (NodeName, Quadkey),
+        cell: NodeName,
+        tile: Quadkey,
         run: Uuid,
         limits: Limits,
         counters: Arc<Counters>,

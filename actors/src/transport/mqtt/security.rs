@@ -57,7 +57,8 @@ impl Security {
     pub fn load(
         tls: Option<(&TlsConfig, &NodeName)>,
         mqtt: &MqttConfig,
-        (membership, cell): (&MembershipConfig, &NodeName),
+        membership: &MembershipConfig,
+        cell: &NodeName,
     ) -> Result<Self, SecurityError> {
         let credentials = tls
             .map(|(files, name)| Credentials::load(files, name))
@@ -133,7 +134,7 @@ impl Security {
                     .credentials
                     .as_ref()
                     .map(|credentials| credentials.current());
-                external_broker((*key, ca), current.as_deref()).map(Some)
+                external_broker(key, ca, current.as_deref()).map(Some)
             }
             Some(ExternalBroker { ca: None, .. }) => Ok(None),
             None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),
@@ -311,8 +312,7 @@ mod tests {
             let tls = authority.tls_of(&name);
             let mqtt = MqttConfig::default();
             let membership = MembershipConfig::default();
-            let security =
-                Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
+            let security = Security::load(Some((&tls, &name)), &mqtt, &membership, &cell).unwrap();
             let fault = security.clock_fault();
             assert_eq!(
                 fault
@@ -344,7 +344,7 @@ mod tests {
             };
             let mqtt = MqttConfig::default();
             let membership = MembershipConfig::default();
-            Security::load(Some((&tls, name)), &mqtt, (&membership, &cell)).unwrap()
+            Security::load(Some((&tls, name)), &mqtt, &membership, &cell).unwrap()
         });
         let certificate = of_edge
             .credentials

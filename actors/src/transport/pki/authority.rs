@@ -448,8 +448,7 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
         return Err(AuthorityError::Missing(directory.into()));
     }
     let text = read(&path)?;
-    let register = content(text.as_bytes());
-    let register = register
+    let register = content(text.as_bytes())
         .and_then(|register| serde_json::from_slice(register).map_err(|error| error.to_string()));
     register.map_err(|reason| AuthorityError::Register { path, reason })
 }

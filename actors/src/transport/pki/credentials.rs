@@ -274,27 +274,31 @@ impl Credentials {
             let due = RELOAD_INTERVAL
                 .saturating_sub(since)
                 .max(Duration::from_millis(1));
-            timeout(due, changed).await.unwrap_or_default();
+            // The files are checked again in either case.
+            let _ = timeout(due, changed).await;
         }
     }
 }
 
 /// Trust in a broker outside the cell. Its certificate must be signed by a CA in `ca` and have the
-/// configured host name. The node presents its own certificate, if it has one.
+/// configured host name. The node presents its own certificate, if it has one. `key` is the key of
+/// the configuration that names `ca`.
 ///
 /// # Errors
 /// Returns a [`CredentialsError`] that names the file.
 pub fn external_broker(
-    (key, ca): (&'static str, &Path),
+    key: &'static str,
+    ca: &Path,
     own: Option<&LoadedCredentials>,
 ) -> Result<BrokerTrust, CredentialsError> {
     let roots = Arc::new(roots(key, ca)?);
-    let verifier =
-        WebPkiServerVerifier::builder_with_provider(Arc::clone(&roots), crypto()).build();
-    let verifier = verifier.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
-    let builder =
-        ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
-    let builder = builder.map_err(unusable)?.with_root_certificates(roots);
+    let verifier = WebPkiServerVerifier::builder_with_provider(Arc::clone(&roots), crypto())
+        .build()
+        .map_err(|error| CredentialsError::Unusable(error.to_string()))?;
+    let builder = ClientConfig::builder_with_provider(crypto())
+        .with_safe_default_protocol_versions()
+        .map_err(unusable)?
+        .with_root_certificates(roots);
     let client = match own {
         Some(own) => builder
             .with_client_auth_cert(own.certificates.clone(), own.key.clone_key())
@@ -362,8 +366,8 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     server.send_tls13_tickets = 0;
     let brokers = ServingNodes::brokers(&issuers);
     let doors = ServingNodes::doors(&issuers);
-    let broker_name = ServerName::try_from(BROKER_NAME);
-    let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
+    let broker_name = ServerName::try_from(BROKER_NAME)
+        .map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let mut client = ClientConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?

@@ -136,8 +136,8 @@ impl EvidenceSigner {
         let signature = share
             .signed
             .as_ref()
-            .and_then(|signed| BASE64.decode(&signed.signature).ok());
-        let signature = signature.ok_or(EvidenceError::Signature)?;
+            .and_then(|signed| BASE64.decode(&signed.signature).ok())
+            .ok_or(EvidenceError::Signature)?;
         let is_signed = is_signed_with(
             &signatory.public_key,
             &share.signed_bytes(&self.cell),

@@ -46,8 +46,10 @@ pub(crate) struct NewKey {
 impl NewKey {
     pub(crate) fn generate() -> Result<Self, rcgen::Error> {
         let key = KeyPair::generate()?;
-        let request = CertificateParams::default().serialize_request(&key)?;
-        let request = request.der().to_vec();
+        let request = CertificateParams::default()
+            .serialize_request(&key)?
+            .der()
+            .to_vec();
         Ok(Self { key, request })
     }
 

@@ -67,8 +67,10 @@ impl CertificateSubject {
             .ok()
             .and_then(|name| NodeName::new(name).ok())
             .ok_or(InvalidCertificate::NoName)?;
-        let alternatives = parsed.subject_alternative_name().ok().flatten();
-        let alternatives = alternatives
+        let alternatives = parsed
+            .subject_alternative_name()
+            .ok()
+            .flatten()
             .map(|names| &names.value.general_names[..])
             .unwrap_or_default();
         let may_serve = alternatives

@@ -86,8 +86,7 @@ pub(super) fn evaluate_files(
             several.len()..=several.len()
         }
     };
-    let truth = TrackTruth::from_sequences(&truth, *frame_rate);
-    let truth = truth
+    let truth = TrackTruth::from_sequences(&truth, *frame_rate)
         .with_context(|| format!("truth {}", path.display()))
         .map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);

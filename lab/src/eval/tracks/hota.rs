@@ -22,19 +22,35 @@ pub(super) struct Hota {
 /// Thresholds on the similarity, in twentieths.
 const TWENTIETHS: std::ops::RangeInclusive<u32> = 1..=19;
 
+/// Identities of a matched pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct Identities {
+    truth: u32,
+    said: u32,
+}
+
+impl Identities {
+    fn of(frame: &ScoredFrame, pair: &MatchedPair) -> Self {
+        Self {
+            truth: frame.truth[pair.truth].id,
+            said: frame.said[pair.said].id,
+        }
+    }
+}
+
 /// Frequency of identities, and the share of their lives that they have in common.
 #[derive(Default)]
 struct Lives {
     truth: HashMap<u32, f64>,
     said: HashMap<u32, f64>,
-    shared: HashMap<(u32, u32), f64>,
+    shared: HashMap<Identities, f64>,
 }
 
 /// Figures at one threshold.
 #[derive(Default)]
 struct AtThreshold {
     similarity_sum: f64,
-    matches: HashMap<(u32, u32), f64>,
+    matches: HashMap<Identities, f64>,
 }
 
 pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
@@ -42,7 +58,7 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
     let lives = Lives::of(frames, &similar);
     let mut at: Vec<AtThreshold> = TWENTIETHS.map(|_| AtThreshold::default()).collect();
     for (frame, pairs) in frames.iter().zip(&similar) {
-        let ids = |pair: &MatchedPair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
+        let ids = |pair: &MatchedPair| Identities::of(frame, pair);
         let worth: Vec<MatchedPair> = pairs
             .iter()
             .map(|pair| MatchedPair {
@@ -97,8 +113,7 @@ impl Lives {
             }
             for pair in pairs.iter().filter(|pair| pair.value > 0.0) {
                 let share = pair.value / (of_truth[pair.truth] + of_said[pair.said] - pair.value);
-                let ids = (frame.truth[pair.truth].id, frame.said[pair.said].id);
-                *lives.shared.entry(ids).or_default() += share;
+                *lives.shared.entry(Identities::of(frame, pair)).or_default() += share;
             }
             frame
                 .truth
@@ -113,12 +128,12 @@ impl Lives {
     }
 
     /// Frames with both identities, divided by frames with at least one of them.
-    fn overlap(&self, ids: (u32, u32)) -> f64 {
+    fn overlap(&self, ids: Identities) -> f64 {
         self.jaccard(ids, self.shared.get(&ids).copied().unwrap_or(0.0))
     }
 
-    fn jaccard(&self, (truth, said): (u32, u32), together: f64) -> f64 {
-        together / (self.truth[&truth] + self.said[&said] - together).max(1.0)
+    fn jaccard(&self, ids: Identities, together: f64) -> f64 {
+        together / (self.truth[&ids.truth] + self.said[&ids.said] - together).max(1.0)
     }
 }
 

@@ -232,14 +232,16 @@ impl<'a> RenderView<'a> {
             return self.surroundings(ray, &sight);
         };
         let code_m = self.top_m - self.placard.card_width_m / 2.0;
-        let ink = met.front
-            && met
-                .face
-                .is_ink(met.right_m, met.up_m - code_m, self.placard);
-        let colour = match (ink, met.front) {
-            (true, _) => INK,
-            (false, true) => PAPER,
-            (false, false) => CARDBOARD,
+        let is_ink = || {
+            met.face
+                .is_ink(met.right_m, met.up_m - code_m, self.placard)
+        };
+        let colour = if !met.front {
+            CARDBOARD
+        } else if is_ink() {
+            INK
+        } else {
+            PAPER
         };
         let towards = if met.front { 1.0 } else { -1.0 };
         let lit = 0.9 + 0.1 * (met.face.card.facing_rad - 0.6).cos() as f32 * towards;

@@ -137,11 +137,22 @@ impl<'a> ConfusionModel<'a> {
     }
 }
 
-/// Forward metres and bearing of an object in view of a camera.
-fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<(f64, f64)> {
+/// Where a camera sees an object.
+#[derive(Debug, Clone, Copy)]
+struct Sight {
+    /// Distance along the optical axis.
+    forward_m: f64,
+    bearing_rad: f64,
+}
+
+/// Where a camera sees an object; `None` out of its view.
+fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<Sight> {
     let (range_m, bearing_rad) = pose.range_bearing(&object.position);
     let in_view = bearing_rad.abs() <= camera.horizontal_field_of_view() / 2.0;
-    (in_view && range_m > 0.0).then(|| (range_m * bearing_rad.cos(), bearing_rad))
+    (in_view && range_m > 0.0).then(|| Sight {
+        forward_m: range_m * bearing_rad.cos(),
+        bearing_rad,
+    })
 }
 
 /// The object that a vehicle takes a detection for.
@@ -185,10 +196,10 @@ fn glimpse(
 
 impl Glimpse {
     /// The detection of an object that is now elsewhere; `None` where it leaves the image.
-    fn at(&self, camera: &Intrinsics, (forward_m, bearing_rad): (f64, f64)) -> Option<Detection> {
+    fn at(&self, camera: &Intrinsics, sight: Sight) -> Option<Detection> {
         let recorded = &self.detection.bounding_box;
-        let scale = self.forward_m / forward_m;
-        let x = camera.cx - camera.fx * (bearing_rad + self.bearing_error_rad).tan();
+        let scale = self.forward_m / sight.forward_m;
+        let x = camera.cx - camera.fx * (sight.bearing_rad + self.bearing_error_rad).tan();
         let y = camera.cy + (recorded.center().y - camera.cy) * scale;
         let half_width = recorded.width() * scale / 2.0;
         let half_height = recorded.height() * scale / 2.0;

@@ -1,6 +1,7 @@
 //! From the numbers of a network's outputs to boxes with scores.
 
 use ecod::model::detection::BoundingBox;
+use nalgebra::Vector2;
 
 use super::family::{Family, Head, Layout, STRIDES};
 use super::network::NamedTensor;
@@ -18,9 +19,34 @@ enum Edges {
     RowFirst,
 }
 
+/// A class of an object, by its place in the list of classes, with its score or logit.
+#[derive(Debug, Clone, Copy)]
+struct ScoredClass {
+    class: usize,
+    score: f32,
+}
+
+impl ScoredClass {
+    /// The same class, its score multiplied by the objectness.
+    fn times(self, objectness: f32) -> Self {
+        Self {
+            score: self.score * objectness,
+            ..self
+        }
+    }
+
+    /// The same class, with the probability for its logit.
+    fn sigmoid(self) -> Self {
+        Self {
+            score: 1.0 / (1.0 + (-self.score).exp()),
+            ..self
+        }
+    }
+}
+
 impl Edges {
     /// The box, each direction multiplied by its scale.
-    fn bounds(self, numbers: [f32; 4], (scale_x, scale_y): (f64, f64)) -> BoundingBox {
+    fn bounds(self, numbers: [f32; 4], scale: Vector2<f64>) -> BoundingBox {
         let [a, b, c, d] = numbers.map(f64::from);
         let (x_min, y_min, x_max, y_max) = match self {
             Self::Centre => (a - c / 2.0, b - d / 2.0, a + c / 2.0, b + d / 2.0),
@@ -28,10 +54,10 @@ impl Edges {
             Self::RowFirst => (b, a, d, c),
         };
         BoundingBox {
-            x_min: x_min * scale_x,
-            y_min: y_min * scale_y,
-            x_max: x_max * scale_x,
-            y_max: y_max * scale_y,
+            x_min: x_min * scale.x,
+            y_min: y_min * scale.y,
+            x_max: x_max * scale.x,
+            y_max: y_max * scale.y,
         }
     }
 }
@@ -51,43 +77,38 @@ impl Head {
                 .and_then(|o| o.shape.last())
                 .map_or(1, |last| (*last).max(1))
         };
-        let pixels = (1.0, 1.0);
-        let shares = (f64::from(input.width), f64::from(input.height));
+        let pixels = Vector2::repeat(1.0);
+        let shares = Vector2::new(f64::from(input.width), f64::from(input.height));
         let best = |scores: &[f32]| {
             scores
                 .iter()
                 .copied()
                 .enumerate()
                 .max_by(|a, b| a.1.total_cmp(&b.1))
+                .map(|(class, score)| ScoredClass { class, score })
         };
-        let found =
-            |(class, score): (usize, f32), edges: Edges, numbers: [f32; 4], scale: (f64, f64)| {
-                (score >= least).then(|| ScoredBox {
-                    class,
-                    score,
-                    bounds: edges.bounds(numbers, scale),
-                })
-            };
+        let found = |best: ScoredClass, edges: Edges, numbers: [f32; 4], scale: Vector2<f64>| {
+            (best.score >= least).then(|| ScoredBox {
+                class: best.class,
+                score: best.score,
+                bounds: edges.bounds(numbers, scale),
+            })
+        };
         match self.layout {
             Layout::Objectness(output) => values(output)
                 .chunks_exact(width(output))
                 .filter_map(|row| {
-                    let (class, score) = best(row.get(5..)?)?;
-                    found((class, score * row[4]), Edges::Centre, four(row)?, pixels)
+                    let best = best(row.get(5..)?)?.times(row[4]);
+                    found(best, Edges::Centre, four(row)?, pixels)
                 })
                 .collect(),
             Layout::Cells(output) => cells(input)
                 .zip(values(output).chunks_exact(width(output)))
                 .filter_map(|((column, line, stride), row)| {
-                    let (class, score) = best(row.get(5..)?)?;
+                    let best = best(row.get(5..)?)?.times(row[4]);
                     let [x, y, width, height] = four(row)?;
                     let numbers = [x + column, y + line, width.exp(), height.exp()];
-                    found(
-                        (class, score * row[4]),
-                        Edges::Centre,
-                        numbers,
-                        (stride, stride),
-                    )
+                    found(best, Edges::Centre, numbers, Vector2::repeat(stride))
                 })
                 .collect(),
             Layout::Columns(output) => {
@@ -115,8 +136,12 @@ impl Head {
                     (Edges::Corners, pixels)
                 };
                 let rows = values(output).chunks_exact(6);
-                rows.filter_map(|row| found((class_of(row[5])?, row[4]), edges, four(row)?, scale))
-                    .collect()
+                rows.filter_map(|row| {
+                    let class = class_of(row[5])?;
+                    let score = row[4];
+                    found(ScoredClass { class, score }, edges, four(row)?, scale)
+                })
+                .collect()
             }
             Layout::Queries { boxes, logits } => values(boxes)
                 .chunks_exact(4)
@@ -125,7 +150,7 @@ impl Head {
                     let best = if self.family == Family::Detr {
                         softmax(logits)?
                     } else {
-                        sigmoid(best(logits)?)
+                        best(logits)?.sigmoid()
                     };
                     found(best, Edges::Centre, four(row)?, shares)
                 })
@@ -135,8 +160,14 @@ impl Head {
                 .zip(values(scores).chunks_exact(width(scores)))
                 .filter_map(|(row, scores)| {
                     let first = self.first_class;
-                    let (class, score) = best(scores.get(first..)?)?;
-                    found((class + first, score), Edges::Corners, four(row)?, shares)
+                    let ScoredClass { class, score } = best(scores.get(first..)?)?;
+                    let class = class + first;
+                    found(
+                        ScoredClass { class, score },
+                        Edges::Corners,
+                        four(row)?,
+                        shares,
+                    )
                 })
                 .collect(),
             Layout::Listed {
@@ -155,7 +186,9 @@ impl Head {
                     .zip(values(classes));
                 lists
                     .filter_map(|((row, score), class)| {
-                        found((class_of(*class)?, *score), edges, four(row)?, scale)
+                        let class = class_of(*class)?;
+                        let score = *score;
+                        found(ScoredClass { class, score }, edges, four(row)?, scale)
                     })
                     .collect()
             }
@@ -183,12 +216,8 @@ fn cells(input: ImageSize) -> impl Iterator<Item = (f32, f32, f64)> {
     })
 }
 
-fn sigmoid((class, logit): (usize, f32)) -> (usize, f32) {
-    (class, 1.0 / (1.0 + (-logit).exp()))
-}
-
 /// The most probable class with its probability; the last logit is for no object.
-fn softmax(logits: &[f32]) -> Option<(usize, f32)> {
+fn softmax(logits: &[f32]) -> Option<ScoredClass> {
     let most = logits.iter().copied().max_by(f32::total_cmp)?;
     let sum: f32 = logits.iter().map(|logit| (logit - most).exp()).sum();
     let (_, classes) = logits.split_last()?;
@@ -197,5 +226,6 @@ fn softmax(logits: &[f32]) -> Option<(usize, f32)> {
         .copied()
         .enumerate()
         .max_by(|a, b| a.1.total_cmp(&b.1))?;
-    Some((class, (logit - most).exp() / sum))
+    let score = (logit - most).exp() / sum;
+    Some(ScoredClass { class, score })
 }

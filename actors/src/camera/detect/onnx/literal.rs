@@ -123,7 +123,7 @@ impl Parser<'_> {
 
     fn escape(&mut self, text: &mut Vec<u16>) -> Result<(), String> {
         let escaped = self.0.next().ok_or("a quote is missing")?;
-        let c = match escaped {
+        let character = match escaped {
             // JSON writes a character of a higher plane as two of these.
             'u' => {
                 text.push(self.code(4)? as u16);
@@ -139,7 +139,7 @@ impl Parser<'_> {
             '\'' | '"' | '\\' | '/' => Some(escaped),
             _ => None,
         };
-        let c = c.ok_or_else(|| format!("\\{escaped} is no escape"))?;
+        let c = character.ok_or_else(|| format!("\\{escaped} is no escape"))?;
         text.extend_from_slice(c.encode_utf16(&mut [0; 2]));
         Ok(())
     }

@@ -102,8 +102,10 @@ impl Door {
         if !setup.serves_nodes {
             return true;
         }
-        let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
-        let named = named.and_then(|(name, _)| NodeName::new(name).ok());
+        let named = client_id
+            .rsplit_once('-')
+            .filter(|(_, run)| is_run(run))
+            .and_then(|(name, _)| NodeName::new(name).ok());
         let is_own = |name: &NodeName| name.vehicle() == setup.node && !(setup.is_member)(name);
         match &principal.identity {
             Some(identity) if identity.name() != &setup.node => false,
@@ -130,7 +132,8 @@ impl Door {
     pub(in crate::transport::broker) fn take(
         &self,
         principal: &Principal,
-        (place, topic): (TopicPlace, &str),
+        place: TopicPlace,
+        topic: &str,
         publish: &Publish,
     ) -> Result<(), DoorRefusal> {
         let Some(door) = self.0.as_deref() else {
@@ -226,7 +229,7 @@ impl Door {
             text = refusal.text,
             "program's message refused"
         );
-        let status = lock(&door.refusals).note(&setup.node, (client, topic), refusal, clock::now());
+        let status = lock(&door.refusals).note(&setup.node, client, topic, refusal, clock::now());
         if let Some(status) = status {
             let topic = setup.topics.clients(&setup.node);
             door.retain(Publication {
@@ -549,9 +552,10 @@ impl DoorHooks {
     /// left is identified by the client id with which it had logged in, because its last will is
     /// still to come.
     fn program(&self, session: &Session) -> Option<Principal> {
-        let principal = self.principals.principal(session.id.remote_addr);
-        let principal =
-            principal.unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
+        let principal = self
+            .principals
+            .principal(session.id.remote_addr)
+            .unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
         self.door
             .is_program(&principal, &session.id.client_id)
             .then_some(principal)
@@ -583,8 +587,7 @@ impl Handler for DoorHooks {
                 moved.topic = place.topic(&publish.topic).into();
                 // rmqtt calls `Permissions` for a published message, but not for a last will.
                 if let FromType::LastWill = from.typ()
-                    && let Err(refusal) =
-                        self.door.take(&principal, (place, &publish.topic), publish)
+                    && let Err(refusal) = self.door.take(&principal, place, &publish.topic, publish)
                 {
                     let client = &session.id.client_id;
                     self.door.note_refusal(client, &publish.topic, &refusal);

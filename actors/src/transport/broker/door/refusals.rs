@@ -87,7 +87,8 @@ impl Refusals {
     pub(super) fn note(
         &mut self,
         node: &NodeName,
-        (client, topic): (&str, &str),
+        client: &str,
+        topic: &str,
         refusal: &DoorRefusal,
         now: Timestamp,
     ) -> Option<Vec<u8>> {
@@ -149,7 +150,8 @@ mod tests {
         let refusal = DoorRefusal::not_permitted("no");
         let status = refusals.note(
             &node,
-            (client, "detections/gauss"),
+            client,
+            "detections/gauss",
             &refusal,
             Timestamp(at_s * 1_000_000),
         )?;

@@ -12,7 +12,7 @@ use crate::transport::gossip::frame::{
     FrameHeader, FrameKind, Handshake, Hello, Introduction, NameClaim,
 };
 use crate::transport::gossip::handshake::{
-    Attestation, Proven, Side, SignedMessage, Transcript, agree,
+    Attestation, KeyAgreement, PendingKey, Proven, Side, SignedMessage, Transcript, agree,
 };
 use crate::transport::gossip::key::{Cookie, SessionId};
 use crate::transport::gossip::node_id::NodeId;
@@ -102,13 +102,12 @@ impl Sessions {
                     introduction,
                 };
                 if self.prove_certificates() {
-                    let frame = self.prove(
-                        &head.sender,
-                        &proof,
-                        (cookie, arrival.from),
-                        &name,
-                        arrival.now,
-                    );
+                    let challenge = PendingKey {
+                        session: head.sender,
+                        address: arrival.from,
+                        cookie,
+                    };
+                    let frame = self.prove(&proof, challenge, &name, arrival.now);
                     return Ok(frame.map_or(FrameContent::Nothing, FrameContent::Answer));
                 }
                 Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)))
@@ -126,9 +125,10 @@ impl Sessions {
                         keys: None,
                         is_proof: true,
                     };
-                    let claim = match is_namesake {
-                        true => NameClaim::Taken,
-                        false => self.admit(head, &introduction.id, admission, arrival)?,
+                    let claim = if is_namesake {
+                        NameClaim::Taken
+                    } else {
+                        self.admit(head, &introduction.id, admission, arrival)?
                     };
                     let answer = Introduction {
                         id: arrival.own.clone(),
@@ -153,17 +153,13 @@ impl Sessions {
                     });
                 }
                 let attestation = decode(attestation)?;
-                self.take_proof(head, (signed, &attestation), introduction, &cookie, arrival)
+                self.take_proof(head, signed, &attestation, introduction, &cookie, arrival)
             }
             Handshake::Accept { echo, introduction } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 let admission = if self.prove_certificates() {
-                    self.take_accept(
-                        head,
-                        (signed, &decode(attestation)?),
-                        &introduction,
-                        arrival,
-                    )?
+                    let attestation = decode(attestation)?;
+                    self.take_accept(head, signed, &attestation, &introduction, arrival)?
                 } else {
                     Admission {
                         proven: None,
@@ -212,14 +208,12 @@ impl Sessions {
     /// answered.
     fn prove(
         &mut self,
-        to: &SessionId,
         proof: &Handshake,
-        (cookie, address): (Cookie, SocketAddr),
+        challenge: PendingKey,
         accepter: &NodeName,
         now: Timestamp,
     ) -> Option<Vec<u8>> {
-        let pending = (*to, address, cookie);
-        let wants_proof = self.prover.as_mut()?.wants_proof(&pending, now);
+        let wants_proof = self.prover.as_mut()?.wants_proof(&challenge, now);
         let head = self.head(FrameKind::Handshake);
         let message = encode(proof);
         let prover = self.prover.as_mut().filter(|_| wants_proof)?;
@@ -227,20 +221,22 @@ impl Sessions {
         let signed = SignedMessage {
             side: Side::Prover,
             head: head.bytes(self.key.tag()),
-            receiver: *to,
+            receiver: challenge.session,
             context: accepter.as_str().as_bytes(),
             message: &message,
         };
         let (attestation, transcript) = prover.attest(&signed, public)?;
-        prover.expect_accept(pending, (private, transcript), accepter.clone(), now);
-        Some(self.write_handshake(&head, to, &message, &attestation))
+        prover.expect_accept(challenge, private, transcript, accepter.clone(), now);
+        Some(self.write_handshake(&head, &challenge.session, &message, &attestation))
     }
 
-    /// Verifies a proof, and accepts it with this node's own.
+    /// Verifies a proof, and accepts it with this node's own. `message` is the encoded proof, to
+    /// which the attestation belongs.
     fn take_proof(
         &mut self,
         head: &FrameHeader,
-        (message, attestation): (&[u8], &Attestation),
+        message: &[u8],
+        attestation: &Attestation,
         introduction: Introduction,
         echo: &Cookie,
         arrival: &Arrival<'_>,
@@ -265,8 +261,13 @@ impl Sessions {
             context: arrival.own.name.as_str().as_bytes(),
             message,
         };
-        let claimed = (&introduction.id.name, &head.sender, arrival.from);
-        let (proven, transcript) = prover.check(&signed, attestation, claimed)?;
+        let (proven, transcript) = prover.check(
+            &signed,
+            attestation,
+            &introduction.id.name,
+            &head.sender,
+            arrival.from,
+        )?;
         let Some((private, public)) = prover.draw_ephemeral() else {
             return Ok(FrameContent::Nothing);
         };
@@ -304,13 +305,15 @@ impl Sessions {
                 answer,
             });
         }
-        let keys = agree(
-            &self.key,
-            (private, &attestation.ephemeral),
-            &transcript,
-            (&self.own, &head.sender),
-            false,
-        )?;
+        let agreement = KeyAgreement {
+            cell: &self.key,
+            private,
+            theirs: &attestation.ephemeral,
+            transcript: &transcript,
+            own: &self.own,
+            other: &head.sender,
+        };
+        let keys = agree(agreement, false)?;
         let admission = Admission {
             proven: Some(proven),
             keys: Some(keys),
@@ -325,11 +328,13 @@ impl Sessions {
         })
     }
 
-    /// Verifies the accept of a proof that this node sent.
+    /// Verifies the accept of a proof that this node sent. `message` is the encoded accept, to
+    /// which the attestation belongs.
     fn take_accept(
         &mut self,
         head: &FrameHeader,
-        (message, attestation): (&[u8], &Attestation),
+        message: &[u8],
+        attestation: &Attestation,
         introduction: &Introduction,
         arrival: &Arrival<'_>,
     ) -> Result<Admission, FrameEvent> {
@@ -347,19 +352,20 @@ impl Sessions {
                 continue;
             }
             let signed = accepted(head_bytes, self.own, &proof, message);
-            match prover.check(&signed, attestation, (name, &head.sender, arrival.from)) {
+            match prover.check(&signed, attestation, name, &head.sender, arrival.from) {
                 Ok((proven, transcript)) => {
                     let Some(private) = prover.take_pending(&pending) else {
                         continue;
                     };
-                    let sessions = (&self.own, &head.sender);
-                    let keys = agree(
-                        &self.key,
-                        (private, &attestation.ephemeral),
-                        &transcript,
-                        sessions,
-                        true,
-                    )?;
+                    let agreement = KeyAgreement {
+                        cell: &self.key,
+                        private,
+                        theirs: &attestation.ephemeral,
+                        transcript: &transcript,
+                        own: &self.own,
+                        other: &head.sender,
+                    };
+                    let keys = agree(agreement, true)?;
                     return Ok(Admission {
                         proven: Some(proven),
                         keys: Some(keys),

@@ -203,12 +203,12 @@ impl PeerTable {
         &mut self,
         mut is_expelled: impl FnMut(&PeerSession) -> bool,
     ) -> Vec<NodeName> {
-        let expelled = self
+        let expelled: Vec<_> = self
             .peers
             .iter()
             .filter(|(_, peer)| is_expelled(peer))
-            .map(|(session, _)| *session);
-        let expelled: Vec<_> = expelled.collect();
+            .map(|(session, _)| *session)
+            .collect();
         expelled
             .iter()
             .filter_map(|session| self.remove(session))

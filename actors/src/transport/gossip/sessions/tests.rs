@@ -36,7 +36,7 @@ impl End {
         let address = SocketAddr::from((Ipv4Addr::new(10, 0, 0, session), 1));
         let name = NodeName::from_static(name);
         let cell = NodeName::from_static(cell);
-        let key = (cell.clone(), CellKey::new(&key.repeat(32), &cell));
+        let key = CellKey::new(&key.repeat(32), &cell);
         let id = NodeId {
             name,
             run: 1,
@@ -46,11 +46,16 @@ impl End {
             broker: None,
         };
         let sessions = Sessions::new(
-            key,
-            (&id.name, [session; 16], identity),
-            &[session; 32],
-            4,
-            Arc::default(),
+            SessionsSetup {
+                cell,
+                key,
+                name: &id.name,
+                nonce: [session; 16],
+                identity,
+                secret: &[session; 32],
+                max_peers: 4,
+                counters: Arc::default(),
+            },
             NOW,
         );
         Self {

@@ -101,8 +101,10 @@ impl Authority {
             X509Certificate::from_der(certificate).map_err(|_| InvalidCertificate::Malformed)?;
         let serial = hex::encode(parsed.raw_serial());
         self.register = read_register(&self.directory)?;
-        let issued = self.register.issued.iter();
-        let issued = issued
+        let issued = self
+            .register
+            .issued
+            .iter()
             .filter(|issued| issued.serial == serial && issued.node == *subject.name())
             .find(|_| is_issued_by(&ca, certificate))
             .ok_or(RenewalRefusal::NotIssued)?;

@@ -40,8 +40,8 @@ pub(super) fn authorities_of(
         .revocation_list
         .as_deref()
         .map(|path| lists("tls.city.revocation_list", path))
-        .transpose()?;
-    let own = own.unwrap_or_default();
+        .transpose()?
+        .unwrap_or_default();
     let of_city = authorities("tls.city.ca", &city.ca)?;
     let mut of_cell = Vec::new();
     let mut revoked = Vec::new();
