@@ -111,7 +111,7 @@ impl Candidate {
     }
 
     /// Processes a share of another candidate.
-    fn take(&mut self, share: &LedgerShare, now: Timestamp) -> Result<Merged, Box<dyn Error>> {
+    fn merge(&mut self, share: &LedgerShare, now: Timestamp) -> Result<Merged, Box<dyn Error>> {
         let candidates = std::slice::from_ref(&share.node);
         Ok(self.resync.merge(
             share,
@@ -158,7 +158,7 @@ impl Cell {
             .record(epoch, evidence, &mut self.edge.ledger)
         {
             self.passed_on
-                .extend(self.euclid.take(&signed(share), now)?.shares);
+                .extend(self.euclid.merge(&signed(share), now)?.shares);
         }
         Ok(())
     }
@@ -180,8 +180,8 @@ impl Cell {
         }
         for term in 1..=3 {
             let share = forged(term, vehicles, liars)?;
-            let merged = self.edge.take(&share, now)?;
-            let is_taken = self.euclid.take(&share, now)?.is_news;
+            let merged = self.edge.merge(&share, now)?;
+            let is_taken = self.euclid.merge(&share, now)?.is_news;
             if merged.is_news
                 || merged.refused.is_empty()
                 || (is_taken && !MISLED_WITH_LAST_WORD.contains(&round))
@@ -199,7 +199,7 @@ impl Cell {
         self.passed_on
             .extend(resync.tick(ledger, leadership, now).shares);
         for share in self.passed_on.drain(..).map(signed) {
-            if self.edge.take(&share, now)?.is_news {
+            if self.edge.merge(&share, now)?.is_news {
                 return Err(format!("round {round}: forged evidence was passed on").into());
             }
         }

@@ -264,7 +264,7 @@ impl Aggregator {
                     let is_placed =
                         |object| pace.is_at_landmark(object) || is_tracking && is_near(object);
                     let is_placed = report.objects.iter().any(is_placed);
-                    window.note_place(&report.node, is_placed, now);
+                    window.record_place(&report.node, is_placed, now);
                     let Placements { placed, misplaced } = &mut self.placements;
                     *if is_placed { placed } else { misplaced } += 1;
                 }
@@ -294,7 +294,7 @@ impl Aggregator {
                 self.voted = true;
             }
         }
-        self.expelled.note_report(&report.node.vehicle(), now);
+        self.expelled.record_report(&report.node.vehicle(), now);
         Ok(if self.rounds.report(kind, &report.node, now) {
             self.close(now)
         } else {
@@ -446,9 +446,9 @@ impl Aggregator {
     /// Sets all objects of other cells near this cell, with the ages that they had at `stated_at`.
     /// Their times are by the clock of `now`. They are included in the next maps until they are too
     /// old, and their identities are given to objects that tracking finds at the same place.
-    pub fn take_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
+    pub fn on_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
         if let Some(tracks) = &mut self.tracks {
-            tracks.take_neighbours(objects, stated_at);
+            tracks.on_neighbours(objects, stated_at);
         }
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }

@@ -11,7 +11,7 @@
 //! needs no signature, and other members cannot change the cell alone. Nodes that cannot lead only
 //! follow.
 //!
-//! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`]
+//! Call [`DescriptionExchange::receive`] for every authenticated stamp, [`DescriptionExchange::take`]
 //! for every body, [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership
 //! and membership change, [`DescriptionExchange::revoke`] when certificates are revoked, and
 //! [`DescriptionExchange::tick`] about twice in [`PUBLISH_INTERVAL`]. Equal inputs give equal
@@ -175,7 +175,7 @@ impl DescriptionExchange {
     }
 
     /// Processes a node's authenticated statement about its description.
-    pub fn hear(
+    pub fn receive(
         &mut self,
         from: &NodeName,
         statement: DescriptionStatement,
@@ -198,7 +198,7 @@ impl DescriptionExchange {
     }
 
     /// Processes a body received from a broker; `description.hash` must be the hash of its content.
-    pub fn take(
+    pub fn on_description(
         &mut self,
         description: Arc<CellDescription>,
         now: Timestamp,

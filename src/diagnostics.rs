@@ -256,19 +256,19 @@ impl KnownTrouble {
 impl TroubleRegister {
     /// Records a trouble of the node itself, or about another; returns it if it is news for the
     /// log.
-    pub fn note(
+    pub fn record(
         &mut self,
         kind: TroubleKind,
         about: Option<&str>,
         cause: &str,
         now: Timestamp,
     ) -> Option<Trouble> {
-        self.note_with(kind, about, || cause.to_owned(), kind.remedy(), now)
+        self.record_with(kind, about, || cause.to_owned(), kind.remedy(), now)
     }
 
     /// Records a trouble with a remedy that another node may have supplied. The text of the cause
     /// is only requested when it is needed.
-    pub fn note_with(
+    pub fn record_with(
         &mut self,
         kind: TroubleKind,
         about: Option<&str>,
@@ -326,7 +326,7 @@ impl TroubleRegister {
             let kind = kind.as_str();
             let cause =
                 format!("there are more troubles than have room here, such as {kind} of {about}");
-            return self.note(TroubleKind::NotShown, None, &cause, now);
+            return self.record(TroubleKind::NotShown, None, &cause, now);
         }
         let cause = cause();
         let entry = KnownTrouble {
@@ -464,7 +464,7 @@ mod tests {
         let mut register = TroubleRegister::default();
         let mut lines = 0;
         for s in 0..7300 {
-            let news = register.note(
+            let news = register.record(
                 TroubleKind::Malformed,
                 Some("watson"),
                 &format!("{s} reports"),
@@ -481,7 +481,7 @@ mod tests {
         assert!(register.present(at(7310)).is_empty());
         assert!(
             register
-                .note(
+                .record(
                     TroubleKind::Malformed,
                     Some("watson"),
                     "9 reports",
@@ -499,7 +499,7 @@ mod tests {
     #[test]
     fn long_cause_ends_at_word() {
         let mut register = TroubleRegister::default();
-        register.note(
+        register.record(
             TroubleKind::ImplausibleSize,
             None,
             &"`camera.projection` is 180 ".repeat(20),
@@ -524,7 +524,7 @@ mod tests {
         let mut register = TroubleRegister::default();
         assert!(
             register
-                .note(TroubleKind::Camera, None, "no frame for 5 s", at(1))
+                .record(TroubleKind::Camera, None, "no frame for 5 s", at(1))
                 .is_some()
         );
         assert_eq!(register.present(at(100_000)).len(), 1);
@@ -537,21 +537,21 @@ mod tests {
     #[test]
     fn invented_names_displace_no_troubles() {
         let mut register = TroubleRegister::default();
-        register.note(
+        register.record(
             TroubleKind::ClockOff,
             Some("gauss"),
             "its clock is 5.0 s ahead",
             at(0),
         );
         for n in 0..1000 {
-            register.note(
+            register.record(
                 TroubleKind::Malformed,
                 Some(&format!("v{n}")),
                 "a\nb\u{202E}",
                 at(0),
             );
         }
-        register.note(TroubleKind::Camera, None, "no frame", at(1));
+        register.record(TroubleKind::Camera, None, "no frame", at(1));
         let present = register.present(at(1));
         assert_eq!(present.len(), MAX_ABOUT_OTHERS + 2);
         let own = present
@@ -564,7 +564,7 @@ mod tests {
         );
         assert_eq!(present[2].about.as_deref(), Some("gauss"));
         assert_eq!(present[3].cause, "a b ");
-        register.note(TroubleKind::Malformed, Some("late"), "x", at(60));
+        register.record(TroubleKind::Malformed, Some("late"), "x", at(60));
         assert_eq!(
             shown(&register, at(60)),
             [": no frame", "late: x"],
@@ -577,13 +577,13 @@ mod tests {
         let mut register = TroubleRegister::default();
         for part in 0..100 {
             for kind in [TroubleKind::Malformed, TroubleKind::Misplaced] {
-                register.note(kind, Some(&format!("mallory--{part}")), "x", at(0));
+                register.record(kind, Some(&format!("mallory--{part}")), "x", at(0));
             }
         }
         assert_eq!(register.present(at(0)).len(), MAX_ABOUT_ONE + 1);
         assert!(
             register
-                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .record(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
                 .is_some()
         );
     }
@@ -594,7 +594,7 @@ mod tests {
         let lines = (0..100).filter(|host| {
             let about = format!("10.0.0.{host}");
             register
-                .note(
+                .record(
                     TroubleKind::WrongKey,
                     Some(&about),
                     "heard with another key",
@@ -609,7 +609,7 @@ mod tests {
         );
         assert!(
             register
-                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .record(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
                 .is_some()
         );
         assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 2);
@@ -619,7 +619,7 @@ mod tests {
     fn claimed_names_leave_vehicle_its_share() {
         let mut register = TroubleRegister::default();
         for part in 0..100 {
-            register.note(
+            register.record(
                 TroubleKind::NotAdmitted,
                 Some(&format!("watson--{part}")),
                 "its certificate is of another name",
@@ -628,7 +628,7 @@ mod tests {
         }
         assert!(
             register
-                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .record(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
                 .is_some()
         );
     }
@@ -636,14 +636,14 @@ mod tests {
     #[test]
     fn changed_cause_is_shown_immediately() {
         let mut register = TroubleRegister::default();
-        register.note(
+        register.record(
             TroubleKind::BrokerRefuses,
             Some("hub:1883"),
             "wrong password",
             at(0),
         );
         let mut note = |s| {
-            register.note(
+            register.record(
                 TroubleKind::BrokerRefuses,
                 Some("hub:1883"),
                 "certificate expired",
@@ -660,7 +660,7 @@ mod tests {
     fn any_named_trouble_is_settled() {
         for about in ["", "a".repeat(200).as_str(), "a\u{202E}b"] {
             let mut register = TroubleRegister::default();
-            register.note(TroubleKind::BrokerRefuses, Some(about), "refused", at(0));
+            register.record(TroubleKind::BrokerRefuses, Some(about), "refused", at(0));
             assert!(
                 register.present(at(0))[0].about.is_some(),
                 "it is not the node's own"

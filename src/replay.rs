@@ -339,7 +339,7 @@ impl Replay {
             line.report.pose = None;
         }
         self.close_due_rounds(before, now, &mut output);
-        self.learn_landmarks(&line);
+        self.add_landmarks(&line);
         let votes = if line.kind == ReportKind::VoteDetections {
             line.report.objects.len() as u64
         } else {
@@ -443,7 +443,7 @@ impl Replay {
 
     /// Adds the locations of an open cell: each is at the first object that names it. VOTE needs no
     /// positions and adds locations itself.
-    fn learn_landmarks(&mut self, line: &RecordedReport) {
+    fn add_landmarks(&mut self, line: &RecordedReport) {
         if !self.config.landmarks.is_empty() || line.kind != ReportKind::Detections {
             return;
         }

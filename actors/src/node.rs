@@ -165,7 +165,7 @@ pub type Starting = Pin<Box<dyn Future<Output = Result<NodeHandle, NodeError>> +
 pub fn start(config: NodeConfig) -> Starting {
     Box::pin(async move {
         let vehicle = VehicleParts::new(&config);
-        start_with(vehicle, Presence::Whole, config).await
+        start_with(vehicle, Presence::Active, config).await
     })
 }
 
@@ -382,7 +382,7 @@ impl Actor for Supervisor {
                 state.start_missing(&myself.get_cell()).await?;
             }
             NodeMessage::Move { step, done } => {
-                state.take_step(step, &myself.get_cell()).await?;
+                state.apply_step(step, &myself.get_cell()).await?;
                 // A caller that has stopped waiting needs no answer.
                 let _ = done.send(());
             }

@@ -294,7 +294,7 @@ impl Vehicle {
                 self.outbox
                     .push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
             }
-            Effect::TellLeadership { leadership } => self.leadership = leadership,
+            Effect::PublishLeadership { leadership } => self.leadership = leadership,
             Effect::Lead {
                 epoch,
                 first_round,

@@ -43,24 +43,24 @@ fuzz_target!(|input: (u8, Vec<Step>)| {
     let proves = cell & 1 == 1;
     // A meeting costs as much as many other steps.
     let mut listener = if cell & 0b1110 == 0 {
-        Listener::meet(proves)
+        Listener::member_up(proves)
     } else {
         Listener::alone(proves)
     };
     for step in steps {
         match step {
-            Step::Datagram(frame) => listener.hear(&frame),
-            Step::Sealed { kind, body } => listener.hear_sealed(kind, &body),
-            Step::Greeting { wants_session } => listener.hear_greeting(wants_session),
-            Step::Challenge { edits } => listener.hear_challenge(&edits),
+            Step::Datagram(frame) => listener.receive(&frame),
+            Step::Sealed { kind, body } => listener.receive_sealed(kind, &body),
+            Step::Greeting { wants_session } => listener.receive_greeting(wants_session),
+            Step::Challenge { edits } => listener.receive_challenge(&edits),
             Step::Proof {
                 message,
                 attestation,
-            } => listener.hear_proof(&message, &attestation),
+            } => listener.receive_proof(&message, &attestation),
             Step::Accept {
                 message,
                 attestation,
-            } => listener.hear_accept(&message, &attestation),
+            } => listener.receive_accept(&message, &attestation),
             Step::Wait { ms } => listener.wait(ms.into()),
         }
     }

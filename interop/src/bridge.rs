@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod_client::{
-    Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings,
+    Cell, CpmMessage, Error, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings,
 };
 
 use self::sightings::Sightings;
@@ -126,7 +126,7 @@ impl CpmBridge {
         let carry: Vec<Carry<'_, Error>> = vec![
             Box::new(|| self.send_maps()),
             Box::new(|| self.send_reports()),
-            Box::new(|| self.take_received()),
+            Box::new(|| self.process_received()),
         ];
         until_one_ends(carry, || self.cell.close())
     }
@@ -200,25 +200,25 @@ impl CpmBridge {
         }
     }
 
-    fn take_received(&self) -> Result<(), Error> {
+    fn process_received(&self) -> Result<(), Error> {
         let mut stations = Stations {
             settings: &self.settings,
             places: StationPlaces::default(),
             connected: BTreeMap::new(),
         };
         for message in self.cell.received_cpms() {
-            let message: &ForeignMessage = &*message?;
-            if let Err(refusal) = self.take(&mut stations, message) {
-                self.note(&message.receiver, refusal);
+            let message: &CpmMessage = &*message?;
+            if let Err(refusal) = self.on_message(&mut stations, message) {
+                self.record(&message.receiver, refusal);
             }
         }
         Ok(())
     }
 
-    fn take(
+    fn on_message(
         &self,
         stations: &mut Stations<'_>,
-        message: &ForeignMessage,
+        message: &CpmMessage,
     ) -> Result<(), CpmRefusal> {
         let received = cpm::decode(&message.payload, &self.described().origin)?;
         if received.left_out > 0 {
@@ -258,9 +258,10 @@ impl CpmBridge {
     }
 
     /// Counts a message that was not reported.
-    fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
+    fn record(&self, receiver: &NodeName, refusal: CpmRefusal) {
         let rest = (NodeName::from_static(OTHER_RECEIVERS), refusal);
-        if let Some(((receiver, _), count)) = self.refusals.note((receiver.clone(), refusal), rest)
+        if let Some(((receiver, _), count)) =
+            self.refusals.record((receiver.clone(), refusal), rest)
         {
             log::warn!("no report from cpm/received/{receiver}: {refusal}; {count} so far");
         }
@@ -334,7 +335,7 @@ impl Stations<'_> {
         let Some(whole) = station.segments.join(received)? else {
             return Ok(());
         };
-        if !self.places.take_room(number, now) {
+        if !self.places.reserve_room(number, now) {
             return Err(CpmRefusal::TooOften);
         }
         let frame = Frame {

@@ -61,7 +61,7 @@ impl<K: Clone + Ord> RefusalCounts<K> {
 
     /// Counts one message; beyond [`Self::MAX_KINDS`], as one of `rest`. Returns kind and count for
     /// the log if the count is a power of ten.
-    pub(crate) fn note(&self, kind: K, rest: K) -> Option<(K, u64)> {
+    pub(crate) fn record(&self, kind: K, rest: K) -> Option<(K, u64)> {
         let mut counts = lock(&self.0);
         let has_room = counts.len() < Self::MAX_KINDS || counts.contains_key(&kind);
         let kind = if has_room { kind } else { rest };
@@ -128,7 +128,7 @@ mod tests {
         let refusals = RefusalCounts::default();
         let told: Vec<_> = (0..1000)
             .chain(0..1000)
-            .filter_map(|kind| refusals.note(kind, 9999))
+            .filter_map(|kind| refusals.record(kind, 9999))
             .collect();
         let first = (0..256).map(|kind| (kind, 1));
         assert_eq!(

@@ -212,7 +212,7 @@ impl RosBridge {
             Box::new(|| self.send_reports()),
         ];
         if self.input.is_some() {
-            carry.push(Box::new(|| self.take_detections()));
+            carry.push(Box::new(|| self.process_detections()));
         }
         until_one_ends(carry, || self.close())
     }
@@ -252,7 +252,7 @@ impl RosBridge {
         Ok(())
     }
 
-    fn take_detections(&self) -> Result<(), RosBridgeError> {
+    fn process_detections(&self) -> Result<(), RosBridgeError> {
         let Some(closed) = lock(&self.closed).take() else {
             return Ok(());
         };
@@ -280,7 +280,7 @@ impl RosBridge {
         for taken in block_on_stream(select_all(streams)) {
             let placed = match taken {
                 Taken::Patience => {
-                    self.tell_of_silence();
+                    self.report_silence();
                     continue;
                 }
                 Taken::InSpace(detections) => self.camera.place(&detections, poses.as_ref()),
@@ -293,7 +293,7 @@ impl RosBridge {
                 }
                 Taken::Pose(stamped) => {
                     if let Some(poses) = &mut poses {
-                        self.take_pose(&stamped, poses);
+                        self.on_pose(&stamped, poses);
                     }
                     continue;
                 }
@@ -301,18 +301,20 @@ impl RosBridge {
             };
             let (frame, unplaced) = match placed {
                 Ok((frame, _)) if !is_within(frame.captured_at, MAX_STAMP_DIFFERENCE) => {
-                    self.note(InputRefusal::BadTime.with(seconds(frame.captured_at)));
+                    self.record(InputRefusal::BadTime.with(seconds(frame.captured_at)));
                     continue;
                 }
                 Ok(placed) => placed,
                 Err(refusal) => {
-                    self.note(refusal);
+                    self.record(refusal);
                     continue;
                 }
             };
-            unplaced.into_iter().for_each(|refusal| self.note(refusal));
+            unplaced
+                .into_iter()
+                .for_each(|refusal| self.record(refusal));
             match self.cell.report(frame) {
-                Err(Error::Invalid(cause)) => self.note(InputRefusal::Report.with(cause)),
+                Err(Error::Invalid(cause)) => self.record(InputRefusal::Report.with(cause)),
                 sent => drop(sent?),
             }
         }
@@ -320,7 +322,7 @@ impl RosBridge {
     }
 
     /// Processes a pose of the camera, if its time is current and later than the previous poses.
-    fn take_pose(&self, stamped: &PoseStamped, poses: &mut PoseHistory) {
+    fn on_pose(&self, stamped: &PoseStamped, poses: &mut PoseHistory) {
         let taken = pose_in_map(stamped).and_then(|(at, pose)| {
             let is_near = is_within(
                 SystemTime::UNIX_EPOCH + Duration::from_micros(at.micros()),
@@ -334,7 +336,7 @@ impl RosBridge {
             }
         });
         if let Err(refusal) = taken {
-            self.note(refusal);
+            self.record(refusal);
         }
     }
 
@@ -365,7 +367,7 @@ impl RosBridge {
             let taken = match sample {
                 Ok(sample) => Some(taken(sample.into_value())),
                 Err(error) => {
-                    self.note(InputRefusal::Malformed.with(error));
+                    self.record(InputRefusal::Malformed.with(error));
                     None
                 }
             };
@@ -375,7 +377,7 @@ impl RosBridge {
     }
 
     /// Logs the topics on which no message has arrived.
-    fn tell_of_silence(&self) {
+    fn report_silence(&self) {
         for DetectorInput { topic, kind, heard } in lock(&self.inputs).iter() {
             if !heard.load(Ordering::Relaxed) {
                 log::warn!(
@@ -386,9 +388,9 @@ impl RosBridge {
     }
 
     /// Counts an input that is not reported.
-    fn note(&self, refused: RefusedInput) {
+    fn record(&self, refused: RefusedInput) {
         let RefusedInput { refusal, detail } = refused;
-        if let Some((refusal, count)) = self.refusals.note(refusal, refusal) {
+        if let Some((refusal, count)) = self.refusals.record(refusal, refusal) {
             log::warn!("not reported from ROS: {refusal}{detail}; {count} so far");
         }
     }

@@ -186,14 +186,14 @@ impl RegionTown {
     ) -> Result<Accepted, CellRefusal> {
         self.counts.messages += 1;
         self.counts.bytes += payload.len() as u64;
-        let accepted = self.take(path, payload, now);
+        let accepted = self.on_message(path, payload, now);
         if let Err(CellRefusal::Rejected(reason)) = accepted {
             *self.counts.rejected.entry(reason).or_default() += 1;
         }
         accepted
     }
 
-    fn take(
+    fn on_message(
         &mut self,
         path: &str,
         payload: &[u8],

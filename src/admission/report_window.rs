@@ -140,7 +140,7 @@ impl ReportWindow {
             Ok(_) => {
                 vehicle.candidate = None;
                 vehicle.untimely_since = None;
-                vehicle.note_standing(report, received_at);
+                vehicle.record_standing(report, received_at);
             }
             Err(RejectReason::Stale | RejectReason::FromTheFuture) => {
                 vehicle.untimely_since.get_or_insert(received_at);
@@ -178,7 +178,7 @@ impl ReportWindow {
     }
 
     /// Records whether any object of a sender's report has an effect where it is.
-    pub(crate) fn note_place(&mut self, name: &NodeName, is_placed: bool, at: Timestamp) {
+    pub(crate) fn record_place(&mut self, name: &NodeName, is_placed: bool, at: Timestamp) {
         if let Some(vehicle) = self.vehicles.get_mut(name) {
             vehicle.misplaced_since = (!is_placed).then(|| vehicle.misplaced_since.unwrap_or(at));
         }

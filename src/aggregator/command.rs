@@ -49,7 +49,7 @@ pub enum Command {
         /// When it was received.
         received_at: Timestamp,
     },
-    /// [`Aggregator::take_neighbours`].
+    /// [`Aggregator::on_neighbours`].
     TakeNeighbours {
         /// All objects of other cells near this one; their times are by the aggregator's clock.
         objects: Arc<[NeighbourObject]>,
@@ -97,7 +97,7 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::TakeNeighbours { objects, stated_at } => {
-                self.take_neighbours(objects, *stated_at);
+                self.on_neighbours(objects, *stated_at);
             }
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {

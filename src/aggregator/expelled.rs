@@ -38,7 +38,7 @@ impl Expelled {
     }
 
     /// Records that a report of a vehicle has been used.
-    pub(super) fn note_report(&mut self, vehicle: &NodeName, now: Timestamp) {
+    pub(super) fn record_report(&mut self, vehicle: &NodeName, now: Timestamp) {
         if let Some(expulsion) = self.0.get_mut(vehicle) {
             expulsion.is_back |= now > expulsion.at + GRACE;
         }

@@ -95,7 +95,7 @@ impl Reporter {
         }
     }
 
-    fn note(&mut self, now: Timestamp) {
+    fn record(&mut self, now: Timestamp) {
         self.gaps = [self.gaps[1], now.since(self.last_report)];
         self.last_report = now;
     }
@@ -192,7 +192,7 @@ impl RoundTrigger {
         let live = &mut self.live[kind as usize];
         let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
-            vehicle.note(now);
+            vehicle.record(now);
             self.missing -= usize::from(std::mem::take(&mut vehicle.is_awaited));
             if std::mem::take(&mut vehicle.due) {
                 self.due -= 1;

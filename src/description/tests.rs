@@ -54,23 +54,23 @@ fn body_needs_statement_of_candidate() {
     for is_body_first in [true, false] {
         let mut euclid = node("euclid");
         let taken: Vec<_> = if is_body_first {
-            assert_eq!(euclid.take(Arc::clone(&new), at(0)), []);
+            assert_eq!(euclid.on_description(Arc::clone(&new), at(0)), []);
             assert_eq!(
-                euclid.hear(&name("gauss"), word(false, new.stamp()), at(1)),
+                euclid.receive(&name("gauss"), word(false, new.stamp()), at(1)),
                 [],
                 "a vehicle that never leads"
             );
-            euclid.hear(&name("edge"), word(true, new.stamp()), at(2))
+            euclid.receive(&name("edge"), word(true, new.stamp()), at(2))
         } else {
             assert_eq!(
-                euclid.hear(&name("edge"), word(true, new.stamp()), at(0)),
+                euclid.receive(&name("edge"), word(true, new.stamp()), at(0)),
                 []
             );
             assert!(
-                !adopts(&euclid.take(described(1, "forged"), at(1))),
+                !adopts(&euclid.on_description(described(1, "forged"), at(1))),
                 "nobody stated it"
             );
-            euclid.take(Arc::clone(&new), at(2))
+            euclid.on_description(Arc::clone(&new), at(2))
         };
         assert_eq!(
             taken,
@@ -96,18 +96,18 @@ fn one_candidate_changes_no_description() {
     let saved = DescriptionHistory::of(Some(described(1, "right")));
     let mut euclid = DescriptionExchange::new(name("euclid"), true, saved);
     let new = described(2, "new");
-    euclid.take(Arc::clone(&new), at(0));
+    euclid.on_description(Arc::clone(&new), at(0));
     euclid.lead(Some(&name("gauss")), at(1));
     assert!(
-        !adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(2))),
+        !adopts(&euclid.receive(&name("gauss"), candidates(new.stamp()), at(2))),
         "the leader alone"
     );
     assert!(
-        !adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(3))),
+        !adopts(&euclid.receive(&name("gauss"), candidates(new.stamp()), at(3))),
         "the same again"
     );
     assert!(
-        adopts(&euclid.hear(&name("turing"), candidates(new.stamp()), at(4))),
+        adopts(&euclid.receive(&name("turing"), candidates(new.stamp()), at(4))),
         "two who have it from its author"
     );
 }
@@ -116,8 +116,8 @@ fn one_candidate_changes_no_description() {
 fn leader_supplies_missing_description() {
     let mut euclid = node("euclid");
     let right = described(6, "right");
-    euclid.take(Arc::clone(&right), at(0));
-    assert!(!adopts(&euclid.hear(
+    euclid.on_description(Arc::clone(&right), at(0));
+    assert!(!adopts(&euclid.receive(
         &name("turing"),
         candidates(right.stamp()),
         at(1)
@@ -139,8 +139,8 @@ fn merge_order_does_not_matter() {
         let mut euclid = node("euclid");
         for index in 0..sides.len() {
             let side = &sides[(index + turn) % sides.len()];
-            euclid.hear(&name(&format!("n{index}")), word(true, side.stamp()), at(0));
-            euclid.take(Arc::clone(side), at(0));
+            euclid.receive(&name(&format!("n{index}")), word(true, side.stamp()), at(0));
+            euclid.on_description(Arc::clone(side), at(0));
         }
         assert_eq!(euclid.stamp(), winner, "turn {turn}");
     }
@@ -153,7 +153,7 @@ fn local_change_is_published() {
         true,
         DescriptionHistory::of(Some(described(6, "old"))),
     );
-    euclid.hear(
+    euclid.receive(
         &name("edge"),
         word(true, described(8, "unseen").stamp()),
         at(0),
@@ -190,10 +190,10 @@ fn version_far_ahead_is_ignored() {
     );
     let far = described(6 + MAX_VERSION_STEP + 1, "far");
     assert_eq!(
-        euclid.hear(&name("edge"), word(true, far.stamp()), at(0)),
+        euclid.receive(&name("edge"), word(true, far.stamp()), at(0)),
         [CountImplausible { from: name("edge") }]
     );
-    assert!(!adopts(&euclid.take(far, at(0))));
+    assert!(!adopts(&euclid.on_description(far, at(0))));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     assert_eq!(euclid.stamp().version, 7);
     let first = DescriptionStamp {
@@ -201,7 +201,7 @@ fn version_far_ahead_is_ignored() {
         ..Default::default()
     };
     assert_eq!(
-        node("gauss").hear(&name("edge"), word(true, first), at(0)),
+        node("gauss").receive(&name("edge"), word(true, first), at(0)),
         [CountImplausible { from: name("edge") }]
     );
 }
@@ -220,11 +220,11 @@ fn settable_version_suits_all() {
         version: 6 + MAX_VERSION_STEP,
         hash: ContentHash::default(),
     };
-    euclid.hear(&name("liar"), word(true, boast), at(0));
+    euclid.receive(&name("liar"), word(true, boast), at(0));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     let set = Arc::clone(euclid.current().unwrap());
-    gauss.hear(&name("euclid"), word(true, set.stamp()), at(2));
-    assert!(adopts(&gauss.take(set, at(3))));
+    gauss.receive(&name("euclid"), word(true, set.stamp()), at(2));
+    assert!(adopts(&gauss.on_description(set, at(3))));
 }
 
 #[test]
@@ -236,13 +236,13 @@ fn absent_node_adopts_leaders_version() {
         DescriptionHistory::of(Some(described(6, "old"))),
     );
     euclid.lead(Some(&name("edge")), at(0));
-    assert!(!adopts(&euclid.hear(
+    assert!(!adopts(&euclid.receive(
         &name("gauss"),
         word(true, far.stamp()),
         at(1)
     )));
-    euclid.hear(&name("edge"), word(true, far.stamp()), at(2));
-    assert!(adopts(&euclid.take(far, at(3))));
+    euclid.receive(&name("edge"), word(true, far.stamp()), at(2));
+    assert!(adopts(&euclid.on_description(far, at(3))));
 }
 
 #[test]
@@ -252,8 +252,8 @@ fn adoptions_are_limited_per_second() {
     for version in 1..=100 {
         let new = described(version, "new");
         let now = at(version * 10);
-        euclid.hear(&name("liar"), word(true, new.stamp()), now);
-        adopted += u32::from(adopts(&euclid.take(new, now)));
+        euclid.receive(&name("liar"), word(true, new.stamp()), now);
+        adopted += u32::from(adopts(&euclid.on_description(new, now)));
     }
     assert_eq!(adopted, 8, "in a second");
     assert!(adopts(&euclid.tick(at(20_000))));
@@ -273,17 +273,17 @@ fn leader_repeats_only_while_needed() {
         "its brokers may not have it"
     );
     assert!(!publishes(&edge.tick(at(1500))));
-    assert!(publishes(&edge.hear(
+    assert!(publishes(&edge.receive(
         &name("euclid"),
         word(false, DescriptionStamp::default()),
         at(1600)
     )));
     assert!(!publishes(&edge.tick(at(3500))), "not that often");
     assert!(publishes(&edge.tick(at(3600))));
-    edge.hear(&name("euclid"), word(false, held.stamp()), at(3700));
+    edge.receive(&name("euclid"), word(false, held.stamp()), at(3700));
     assert!(!publishes(&edge.tick(at(9000))));
     assert!(
-        publishes(&edge.take(described(2, "displaced"), at(9100))),
+        publishes(&edge.on_description(described(2, "displaced"), at(9100))),
         "an earlier one took its place"
     );
 }
@@ -297,7 +297,7 @@ fn outdated_node_costs_little() {
     );
     edge.lead(Some(&name("edge")), at(0));
     let is_repeated = |ms: &u64| {
-        publishes(&edge.hear(
+        publishes(&edge.receive(
             &name("liar"),
             word(false, DescriptionStamp::default()),
             at(*ms),
@@ -324,13 +324,13 @@ fn candidate_informs_outdated_leader() {
         !publishes(&euclid.lead(Some(&name("edge")), at(0))),
         "the leader has not said what it has"
     );
-    assert!(publishes(&euclid.hear(
+    assert!(publishes(&euclid.receive(
         &name("edge"),
         word(true, DescriptionStamp::default()),
         at(100)
     )));
-    euclid.hear(&name("edge"), word(true, held.stamp()), at(200));
-    euclid.hear(
+    euclid.receive(&name("edge"), word(true, held.stamp()), at(200));
+    euclid.receive(
         &name("gauss"),
         word(false, DescriptionStamp::default()),
         at(300),
@@ -343,7 +343,7 @@ fn candidate_informs_outdated_leader() {
         DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(held)));
     gauss.lead(Some(&name("edge")), at(0));
     assert!(
-        !publishes(&gauss.hear(
+        !publishes(&gauss.receive(
             &name("edge"),
             word(true, DescriptionStamp::default()),
             at(100)
@@ -356,11 +356,14 @@ fn candidate_informs_outdated_leader() {
 fn unstated_bodies_are_bounded() {
     let mut euclid = node("euclid");
     let stated = described(1, "stated");
-    euclid.take(Arc::clone(&stated), at(0));
-    (2..100).for_each(|version| drop(euclid.take(described(version, "junk"), at(0))));
+    euclid.on_description(Arc::clone(&stated), at(0));
+    (2..100).for_each(|version| drop(euclid.on_description(described(version, "junk"), at(0))));
     assert_eq!(euclid.unproven.len(), MAX_UNPROVEN);
-    euclid.hear(&name("edge"), word(true, stated.stamp()), at(1));
-    assert!(adopts(&euclid.take(stated, at(2))), "the leader repeats it");
+    euclid.receive(&name("edge"), word(true, stated.stamp()), at(1));
+    assert!(
+        adopts(&euclid.on_description(stated, at(2))),
+        "the leader repeats it"
+    );
 }
 
 /// Statement of a node with this certificate.
@@ -387,18 +390,20 @@ fn revoked_certificate_removes_its_description() {
     // It sets one after the other, in the name of the edge. A vehicle has them from the edge.
     for (version, text) in [(7, "false"), (8, "worse")] {
         let forged = described(version, text);
-        edge.hear(
+        edge.receive(
             &name("turing"),
             certified("turing's", forged.stamp()),
             at(version),
         );
-        assert!(adopts(&edge.take(Arc::clone(&forged), at(version))));
-        gauss.hear(
+        assert!(adopts(
+            &edge.on_description(Arc::clone(&forged), at(version))
+        ));
+        gauss.receive(
             &name("edge"),
             certified("edge's", forged.stamp()),
             at(version),
         );
-        assert!(adopts(&gauss.take(forged, at(version))));
+        assert!(adopts(&gauss.on_description(forged, at(version))));
     }
     assert_eq!(
         edge.revoke(|certificate| certificate == "euclid's", EMPTY, at(100)),
@@ -417,13 +422,13 @@ fn revoked_certificate_removes_its_description() {
     assert!(adopts(&effects) && publishes(&effects), "{effects:?}");
     let restored = Arc::clone(edge.current().unwrap());
     assert_eq!((restored.version, &*restored.text), (9, "right"));
-    gauss.hear(
+    gauss.receive(
         &name("edge"),
         certified("edge's", restored.stamp()),
         at(300),
     );
     assert!(
-        adopts(&gauss.take(restored, at(300))),
+        adopts(&gauss.on_description(restored, at(300))),
         "also by nodes that have not read the list"
     );
     assert_eq!(
@@ -438,39 +443,39 @@ fn burst_does_not_delay_recovery() {
     let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
     for version in 1..=MAX_ADOPTIONS as u64 {
         let forged = described(version, "false");
-        gauss.hear(
+        gauss.receive(
             &name("edge"),
             certified("edge's", forged.stamp()),
             at(version),
         );
-        assert!(adopts(&gauss.take(forged, at(version))));
+        assert!(adopts(&gauss.on_description(forged, at(version))));
     }
     gauss.revoke(|certificate| certificate == "turing's", EMPTY, at(100));
     let right = described(MAX_ADOPTIONS as u64 + 1, "right");
-    gauss.hear(&name("edge"), certified("edge's", right.stamp()), at(101));
-    assert!(adopts(&gauss.take(right, at(101))));
+    gauss.receive(&name("edge"), certified("edge's", right.stamp()), at(101));
+    assert!(adopts(&gauss.on_description(right, at(101))));
 }
 
 #[test]
 fn node_settings_are_restored() {
     let mut edge = node("edge");
     let forged = described(7, "false");
-    edge.hear(
+    edge.receive(
         &name("turing"),
         certified("turing's", forged.stamp()),
         at(0),
     );
-    edge.take(Arc::clone(&forged), at(0));
+    edge.on_description(Arc::clone(&forged), at(0));
     // A word that was on its way.
     let late = described(8, "late");
-    edge.hear(&name("turing"), certified("turing's", late.stamp()), at(1));
+    edge.receive(&name("turing"), certified("turing's", late.stamp()), at(1));
     assert!(adopts(&edge.revoke(
         |certificate| certificate == "turing's",
         EMPTY,
         at(2)
     )));
     assert!(
-        !adopts(&edge.take(late, at(3))),
+        !adopts(&edge.on_description(late, at(3))),
         "nobody states it any more"
     );
     let empty = edge.current().unwrap();
@@ -495,12 +500,12 @@ fn one_certificate_displaces_no_predecessor() {
     for version in 2..40 {
         let liar = if version % 2 == 0 { "turing" } else { "euclid" };
         let forged = described(version, "false");
-        edge.hear(
+        edge.receive(
             &name(liar),
             certified(liar, forged.stamp()),
             at(version * 10_000),
         );
-        assert!(adopts(&edge.take(forged, at(version * 10_000))));
+        assert!(adopts(&edge.on_description(forged, at(version * 10_000))));
     }
     assert!(adopts(&edge.revoke(|_| true, EMPTY, at(500_000))));
     assert_eq!(edge.current().unwrap().text, "right");
@@ -513,9 +518,9 @@ fn revoking_one_relay_keeps_description() {
     let right = described(6, "right");
     let mut late = node("gauss");
     for candidate in ["alpha", "edge", "turing"] {
-        late.hear(&name(candidate), certified(candidate, right.stamp()), at(0));
+        late.receive(&name(candidate), certified(candidate, right.stamp()), at(0));
     }
-    assert!(adopts(&late.take(Arc::clone(&right), at(1))));
+    assert!(adopts(&late.on_description(Arc::clone(&right), at(1))));
     assert_eq!(
         late.revoke(|certificate| certificate == "alpha", EMPTY, at(100)),
         []

@@ -20,7 +20,7 @@ pub struct EchoMonitor {
 impl EchoMonitor {
     /// Records a message that the broker should echo, on a link that has received `packets` packets
     /// so far. Returns true if the broker is stalled.
-    pub fn note_sent(&mut self, packets: u64, now: Timestamp) -> bool {
+    pub fn record_sent(&mut self, packets: u64, now: Timestamp) -> bool {
         if self.unanswered == 0 || packets != self.packets {
             *self = Self {
                 packets,
@@ -43,7 +43,7 @@ mod tests {
         let mut echo = EchoMonitor::default();
         sent_ms
             .into_iter()
-            .find(|ms| echo.note_sent(7, Timestamp(ms * 1000)))
+            .find(|ms| echo.record_sent(7, Timestamp(ms * 1000)))
     }
 
     #[test]
@@ -65,6 +65,6 @@ mod tests {
     #[test]
     fn any_message_resets_count() {
         let mut echo = EchoMonitor::default();
-        assert!((0..100).all(|n| !echo.note_sent(n / 5, Timestamp(n * 150_000))));
+        assert!((0..100).all(|n| !echo.record_sent(n / 5, Timestamp(n * 150_000))));
     }
 }

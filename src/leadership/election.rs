@@ -195,7 +195,7 @@ impl Election {
             ElectionInput::PeerDown { peer } => self.peer_down(&peer, now),
             ElectionInput::PeerGone { peer } => self.peer_gone(&peer, now),
             ElectionInput::Health { health } => self.set_health(health, now),
-            ElectionInput::Round { epoch, round } => self.note_round(&epoch, round, now),
+            ElectionInput::Round { epoch, round } => self.record_round(&epoch, round, now),
             ElectionInput::NoLogin { at } => self.set_no_login(at, now),
             ElectionInput::Prepared => self.prepared(now),
             ElectionInput::Greet => self.greet(now),
@@ -297,7 +297,7 @@ impl Election {
     /// Processes an authenticated message: checks its term and sequence number, records the
     /// sender's state, and passes the body to the handler of its kind. Messages that are repeated,
     /// overtaken or implausible are dropped before they change any state. For example, a `Beat`
-    /// reaches `take_beat` only if the sender itself leads the stated epoch.
+    /// reaches `on_beat` only if the sender itself leads the stated epoch.
     fn receive(&mut self, mut message: ElectionMessage, now: Timestamp) {
         if message.from == self.id {
             return;
@@ -310,14 +310,14 @@ impl Election {
                 .push(ElectionEffect::CountImplausible { from: message.from });
             return;
         }
-        if !self.peers.note(&message, now) {
+        if !self.peers.record(&message, now) {
             return;
         }
-        self.learn_term(message.term);
+        self.observe_term(message.term);
         if self.terms.window.0 == 0 {
             self.terms.window = (self.terms.seen, now);
         }
-        self.hear_others(&message, now);
+        self.on_foreign_message(&message, now);
         let ElectionMessage {
             from,
             epoch,
@@ -326,11 +326,11 @@ impl Election {
         } = message;
         match message.body {
             Body::Status { over, no_login } => {
-                self.take_status(&from, over.as_ref(), no_login, now);
+                self.on_status(&from, over.as_ref(), no_login, now);
             }
             Body::Ask { ask } => self.answer(&from, ask, now),
             Body::LeaderEvidence { ask, age_ms, life } => {
-                self.take_leader_evidence(&from, epoch, ask, age_ms, life, now);
+                self.on_leader_evidence(&from, epoch, ask, age_ms, life, now);
             }
             Body::Beat {
                 every_ms,
@@ -351,13 +351,13 @@ impl Election {
                         successors,
                         life,
                     };
-                    self.take_beat(beat, now);
+                    self.on_beat(beat, now);
                 }
             }
-            Body::Offer => self.take_offer(&from, epoch.as_ref(), now),
-            Body::Ready => self.take_ready(&from, now),
-            Body::Yield { last_round } => self.take_yield(&from, epoch.as_ref(), last_round, now),
-            Body::Resign { epoch, last_round } => self.take_resign(&epoch, last_round, now),
+            Body::Offer => self.on_offer(&from, epoch.as_ref(), now),
+            Body::Ready => self.on_ready(&from, now),
+            Body::Yield { last_round } => self.on_yield(&from, epoch.as_ref(), last_round, now),
+            Body::Resign { epoch, last_round } => self.on_resign(&epoch, last_round, now),
         }
     }
 
@@ -368,7 +368,7 @@ impl Election {
             && message.candidacy.role != Role::Cav
             && (1..=MAX_FIRST_TERM).contains(&message.term)
         {
-            self.peers.note_term(&message.from, message.term);
+            self.peers.record_term(&message.from, message.term);
         }
         let limit = self.term_limit(message.candidacy.role, now);
         self.unlearn_first_term(limit, now);
@@ -440,12 +440,12 @@ impl Election {
     }
 
     /// Raises the highest used term to `term`.
-    fn learn_term(&mut self, term: u64) {
+    fn observe_term(&mut self, term: u64) {
         self.terms.seen = self.terms.seen.max(term);
     }
 
     /// Records the last round of a leadership as stated by a node.
-    fn learn_round(&mut self, from: &NodeName, round: u64) {
+    fn observe_round(&mut self, from: &NodeName, round: u64) {
         let limit = if self.round == 0 {
             MAX_ROUND
         } else {

@@ -81,7 +81,7 @@ impl HealthMonitor {
 
     /// Records the state of a link. Returns true if an established link has broken and its broker's
     /// port is closed.
-    pub fn note_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
+    pub fn record_link(&mut self, broker: &BrokerAddress, state: LinkState) -> bool {
         match state {
             // A closed port has not been confirmed yet.
             LinkState::Down | LinkState::Stalled => {
@@ -99,7 +99,7 @@ impl HealthMonitor {
     }
 
     /// Records which node's certificate a broker presented.
-    pub fn note_node(&mut self, broker: BrokerAddress, node: NodeName) {
+    pub fn record_node(&mut self, broker: BrokerAddress, node: NodeName) {
         self.nodes.insert(broker, node);
     }
 
@@ -117,7 +117,7 @@ impl HealthMonitor {
 
     /// Records the parts' answers. They also contain links that came up before the monitor received
     /// events.
-    pub fn note_sample(&mut self, sample: HealthSample) {
+    pub fn record_sample(&mut self, sample: HealthSample) {
         for (broker, state) in sample.links.iter().flatten() {
             match state {
                 LinkState::Up | LinkState::Stalled => {
@@ -135,7 +135,7 @@ impl HealthMonitor {
     }
 
     /// Records a check: how often a round has been due so far, and the processor load in percent.
-    pub fn note_look(&mut self, rounds_due: u64, load_percent: u8, now: Timestamp) {
+    pub fn record_load(&mut self, rounds_due: u64, load_percent: u8, now: Timestamp) {
         let due = self.clock.now() + HEALTH_PERIOD;
         let now = self.clock.advance(now, due);
         if rounds_due != self.rounds_due {
@@ -227,8 +227,8 @@ mod tests {
     /// Creates a monitor of parts that have answered and have closed a round.
     fn monitor(now: Timestamp) -> HealthMonitor {
         let mut monitor = HealthMonitor::new(now);
-        monitor.note_sample(sample(Some(BTreeMap::new())));
-        monitor.note_look(1, 0, now);
+        monitor.record_sample(sample(Some(BTreeMap::new())));
+        monitor.record_load(1, 0, now);
         monitor
     }
 
@@ -237,13 +237,16 @@ mod tests {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         let broker = address(1);
         assert!(
-            !monitor.note_link(&broker, LinkState::Refused),
+            !monitor.record_link(&broker, LinkState::Refused),
             "never reached"
         );
-        assert!(!monitor.note_link(&broker, LinkState::Up));
-        assert!(!monitor.note_link(&broker, LinkState::Down));
-        assert!(monitor.note_link(&broker, LinkState::Refused));
-        assert!(!monitor.note_link(&broker, LinkState::Refused), "told once");
+        assert!(!monitor.record_link(&broker, LinkState::Up));
+        assert!(!monitor.record_link(&broker, LinkState::Down));
+        assert!(monitor.record_link(&broker, LinkState::Refused));
+        assert!(
+            !monitor.record_link(&broker, LinkState::Refused),
+            "told once"
+        );
     }
 
     #[test]
@@ -262,16 +265,16 @@ mod tests {
             !monitor.health(&plane, &brokers, false, PERIOD).is_fit(),
             "no link to its own broker yet"
         );
-        monitor.note_link(&address(1), LinkState::Up);
+        monitor.record_link(&address(1), LinkState::Up);
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         for looks in 1..=12 {
-            monitor.note_look(1, 0, now + HEALTH_PERIOD * looks);
+            monitor.record_load(1, 0, now + HEALTH_PERIOD * looks);
         }
         assert!(
             !monitor.health(&plane, &brokers, false, PERIOD).fuser,
             "no rounds"
         );
-        monitor.note_link(&address(1), LinkState::Down);
+        monitor.record_link(&address(1), LinkState::Down);
         assert!(!monitor.health(&plane, &brokers, false, PERIOD).gateway);
     }
 
@@ -288,15 +291,15 @@ mod tests {
                 .health(&plane, &Brokers::default(), false, PERIOD)
                 .fuser
         };
-        monitor.note_look(1, 0, now + Duration::from_secs(10));
+        monitor.record_load(1, 0, now + Duration::from_secs(10));
         assert!(
             fuser(&monitor),
             "the look may come before the fuser's next round"
         );
         let after = |ms| now + Duration::from_secs(10) + Duration::from_millis(ms);
-        (1..=8).for_each(|looks| monitor.note_look(1, 0, after(250 * looks)));
+        (1..=8).for_each(|looks| monitor.record_load(1, 0, after(250 * looks)));
         assert!(!fuser(&monitor), "the fuser had its time");
-        monitor.note_look(2, 0, after(2250));
+        monitor.record_load(2, 0, after(2250));
         assert!(fuser(&monitor));
     }
 
@@ -313,7 +316,7 @@ mod tests {
         for fault in 0..3 {
             let mut monitor = monitor(Timestamp(60_000_000));
             let links = Some(BTreeMap::from([(address(1), LinkState::Up)]));
-            monitor.note_sample(HealthSample {
+            monitor.record_sample(HealthSample {
                 rejects_reports: fault == 0,
                 contradicts: fault == 1,
                 certificate_ends: fault == 2,
@@ -341,12 +344,12 @@ mod tests {
         };
         let links = |state| Some(BTreeMap::from([(address(1), state)]));
         let answer = |state| sample(links(state));
-        monitor.note_sample(answer(LinkState::Up));
+        monitor.record_sample(answer(LinkState::Up));
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-        monitor.note_sample(answer(LinkState::Down));
+        monitor.record_sample(answer(LinkState::Down));
         assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         assert!(
-            monitor.note_link(&address(1), LinkState::Refused),
+            monitor.record_link(&address(1), LinkState::Refused),
             "its end is still news"
         );
     }
@@ -359,7 +362,7 @@ mod tests {
             own: Some(address(1)),
             ..Brokers::default()
         };
-        monitor.note_link(&address(1), LinkState::Up);
+        monitor.record_link(&address(1), LinkState::Up);
         let fit = |monitor: &HealthMonitor, no_other| {
             let plane = DataPlane {
                 external: None,
@@ -368,13 +371,13 @@ mod tests {
             monitor.health(&plane, &brokers, no_other, PERIOD).is_fit()
         };
         assert!(fit(&monitor, false));
-        assert!(!monitor.note_link(&address(1), LinkState::Stalled));
+        assert!(!monitor.record_link(&address(1), LinkState::Stalled));
         assert_eq!((fit(&monitor, false), fit(&monitor, true)), (false, true));
-        monitor.note_link(&address(1), LinkState::Down);
+        monitor.record_link(&address(1), LinkState::Down);
         assert!(!fit(&monitor, true));
-        monitor.note_link(&address(1), LinkState::Stalled);
+        monitor.record_link(&address(1), LinkState::Stalled);
         assert!(
-            monitor.note_link(&address(1), LinkState::Refused),
+            monitor.record_link(&address(1), LinkState::Refused),
             "its end is still news"
         );
     }
@@ -398,7 +401,7 @@ mod tests {
             (LinkState::Stalled, false),
             (LinkState::Down, false),
         ] {
-            monitor.note_link(&address(9), state);
+            monitor.record_link(&address(9), state);
             assert_eq!(reaches(&monitor, true), reached, "{state:?}");
         }
     }
@@ -406,8 +409,8 @@ mod tests {
     #[test]
     fn unused_broker_is_no_login() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
-        monitor.note_link(&address(1), LinkState::Up);
-        monitor.note_link(&address(2), LinkState::Up);
+        monitor.record_link(&address(1), LinkState::Up);
+        monitor.record_link(&address(2), LinkState::Up);
         monitor.forget_links_but(&[address(2)]);
         assert_eq!(
             (
@@ -426,7 +429,7 @@ mod tests {
             own: Some(address(1)),
             ..Brokers::default()
         };
-        monitor.note_link(&address(1), LinkState::Up);
+        monitor.record_link(&address(1), LinkState::Up);
         let fit = |monitor: &HealthMonitor, embedded| {
             let plane = DataPlane {
                 external: Some(address(9)),
@@ -436,7 +439,7 @@ mod tests {
         };
         assert!(!fit(&monitor, false));
         assert!(fit(&monitor, true), "falls back to its own");
-        monitor.note_link(&address(9), LinkState::Up);
+        monitor.record_link(&address(9), LinkState::Up);
         assert!(fit(&monitor, false));
     }
 }

@@ -257,8 +257,8 @@ impl LedgerResync {
         {
             return Err(RejectReason::BadSignature);
         }
-        let has_judged = self.note_leader(ledger, leadership, now);
-        let is_reset = self.take_reset(share, ledger, date);
+        let has_judged = self.record_leader(ledger, leadership, now);
+        let is_reset = self.on_reset(share, ledger, date);
         let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
         let (mut taken, refused) = if is_over {
             (share.clone(), Vec::new())
@@ -280,7 +280,7 @@ impl LedgerResync {
         let leader = share
             .epoch
             .filter(|term| is_leader && leadership.knows_term(*term));
-        self.hear(
+        self.receive(
             leader.map(|term| Epoch::new(term, share.node.clone())),
             ledger,
             candidates,
@@ -308,12 +308,12 @@ impl LedgerResync {
             None if is_statement => ledger.merge_statement(&taken, present),
             Some(_) | None => ledger.merge_share(&taken, present),
         };
-        self.growth.note(&taken, ledger, now);
+        self.growth.record(&taken, ledger, now);
         let is_news = is_news | is_reset | has_judged;
         Ok(Merged {
             is_news,
             refused,
-            shares: self.take_everything(ledger, now),
+            shares: self.share_everything(ledger, now),
         })
     }
 
@@ -393,7 +393,7 @@ impl LedgerResync {
 
     /// Records the current leader; returns true if evidence left probation. The last share of an
     /// old leader may arrive when another node already leads.
-    fn note_leader(
+    fn record_leader(
         &mut self,
         ledger: &mut ReputationLedger,
         leadership: &Leadership,
@@ -438,7 +438,7 @@ impl LedgerResync {
 
     /// Drops all evidence if the share contains a later reset than this node's; returns true in
     /// that case.
-    fn take_reset(
+    fn on_reset(
         &mut self,
         share: &LedgerShare,
         ledger: &mut ReputationLedger,
@@ -463,12 +463,12 @@ impl LedgerResync {
         leadership: &Leadership,
         now: Timestamp,
     ) -> Merged {
-        let is_news = self.note_leader(ledger, leadership, now);
+        let is_news = self.record_leader(ledger, leadership, now);
         if self.growth.len() > 2 * MAX_ENTRIES {
             self.growth.retain(|lane| ledger.has_lane(lane));
         }
-        let mut shares = self.take_everything(ledger, now);
-        shares.extend(self.take_unshared(ledger, leadership));
+        let mut shares = self.share_everything(ledger, now);
+        shares.extend(self.share_unshared(ledger, leadership));
         self.ticks += 1;
         if self.ticks >= self.ticks_per_snapshot {
             self.ticks = 0;
@@ -495,7 +495,12 @@ impl LedgerResync {
 
     /// Records the leader whose share arrived; if the leader is new, schedules evidence to be sent
     /// to it.
-    fn hear(&mut self, leader: Option<Epoch>, ledger: &ReputationLedger, candidates: &[NodeName]) {
+    fn receive(
+        &mut self,
+        leader: Option<Epoch>,
+        ledger: &ReputationLedger,
+        candidates: &[NodeName],
+    ) {
         if leader.is_none() || leader == self.leader {
             return;
         }
@@ -517,7 +522,7 @@ impl LedgerResync {
     }
 
     /// All evidence, if the leader should have it and has not received it recently.
-    fn take_everything(&mut self, ledger: &ReputationLedger, now: Timestamp) -> Vec<LedgerShare> {
+    fn share_everything(&mut self, ledger: &ReputationLedger, now: Timestamp) -> Vec<LedgerShare> {
         let is_due = self
             .everything_sent_at
             .is_none_or(|at| now.since(at) >= FULL_RESYNC_PAUSE);
@@ -559,7 +564,7 @@ impl LedgerResync {
     }
 
     /// Evidence that no candidate has shared with the leader, if it is time to send it.
-    fn take_unshared(
+    fn share_unshared(
         &mut self,
         ledger: &ReputationLedger,
         leadership: &Leadership,

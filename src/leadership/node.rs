@@ -167,10 +167,10 @@ impl LeadershipNode {
             let effects = self.election.tick(now);
             self.carry_out(effects, now);
         } else {
-            self.take(input, now);
+            self.handle_input(input, now);
         }
         self.run_timers(now);
-        self.tell(now);
+        self.publish_changes(now);
         if !self.is_draining {
             let preparation = self
                 .preparation
@@ -207,7 +207,7 @@ impl LeadershipNode {
     /// Dispatches an input to the part that handles it. Two kinds of election messages are stopped
     /// here: messages under another node's name, and `Ready` from a challenger whose broker does
     /// not serve this node. For example, `MemberDown` removes the member and informs the election.
-    fn take(&mut self, input: Input, now: Timestamp) {
+    fn handle_input(&mut self, input: Input, now: Timestamp) {
         match input {
             Input::Wake => {}
             Input::Receive { from, message, .. } if message.from != from => {
@@ -224,7 +224,7 @@ impl LeadershipNode {
             Input::Receive {
                 rights, message, ..
             } => self.receive(message, rights, now),
-            Input::MemberAlive { member } => self.meet(member, now),
+            Input::MemberAlive { member } => self.member_up(member, now),
             Input::MemberChanged { member } => {
                 self.members.place(member);
                 self.update_health(now);
@@ -232,12 +232,12 @@ impl LeadershipNode {
             Input::MemberSuspected { name } => {
                 self.feed(ElectionInput::PeerSuspected { peer: name }, now);
             }
-            Input::MemberDown { name } => self.part_with(name, now),
+            Input::MemberDown { name } => self.member_down(name, now),
             Input::OwnBroker { address } => self.own_broker = address,
-            Input::BrokerProven { broker, node } => self.monitor.note_node(broker, node),
-            Input::LinkChanged { broker, state } => self.take_link(&broker, state, now),
-            Input::StatusHeard { status } => self.take_status(&status, now),
-            Input::RoundAccepted { epoch, round } => self.take_round(epoch, round, now),
+            Input::BrokerProven { broker, node } => self.monitor.record_node(broker, node),
+            Input::LinkChanged { broker, state } => self.on_link(&broker, state, now),
+            Input::StatusHeard { status } => self.on_status(&status, now),
+            Input::RoundAccepted { epoch, round } => self.on_round(epoch, round, now),
             Input::EvidenceReceived { from } => {
                 if let Some(preparation) = self
                     .preparation
@@ -252,10 +252,10 @@ impl LeadershipNode {
                 load_percent,
                 members,
             } => {
-                self.take_look(rounds_due, load_percent, members, now);
+                self.on_check(rounds_due, load_percent, members, now);
             }
             Input::PartsAnswered { sample } => {
-                self.monitor.note_sample(sample);
+                self.monitor.record_sample(sample);
                 self.update_health(now);
             }
             Input::FuserRestarted => {
@@ -340,7 +340,7 @@ impl LeadershipNode {
                     first,
                 } => {
                     self.preparation = None;
-                    self.tell_leadership();
+                    self.publish_leadership();
                     Effect::Lead {
                         epoch,
                         first_round,
@@ -387,7 +387,7 @@ impl LeadershipNode {
         }
     }
 
-    fn meet(&mut self, member: SeenMember, now: Timestamp) {
+    fn member_up(&mut self, member: SeenMember, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
         self.forget_login(&peer, now);
@@ -395,14 +395,14 @@ impl LeadershipNode {
         self.update_health(now);
     }
 
-    fn part_with(&mut self, name: NodeName, now: Timestamp) {
-        self.members.part_with(&name, now);
+    fn member_down(&mut self, name: NodeName, now: Timestamp) {
+        self.members.member_down(&name, now);
         self.forget_login(&name, now);
         self.feed(ElectionInput::PeerDown { peer: name }, now);
     }
 
-    fn take_link(&mut self, broker: &BrokerAddress, state: LinkState, now: Timestamp) {
-        let is_gone = self.monitor.note_link(broker, state);
+    fn on_link(&mut self, broker: &BrokerAddress, state: LinkState, now: Timestamp) {
+        let is_gone = self.monitor.record_link(broker, state);
         self.update_health(now);
         // A broker that belongs to no node gives no evidence about any node.
         if is_gone && self.links.plane().external.as_ref() != Some(broker) {
@@ -420,7 +420,7 @@ impl LeadershipNode {
     /// connection broke is the fastest evidence of the leader's end. Any member can forge this
     /// report, so it ends the leader only once per run; later reports make this node ask about the
     /// leader.
-    fn take_status(&mut self, status: &NodeStatus, now: Timestamp) {
+    fn on_status(&mut self, status: &NodeStatus, now: Timestamp) {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
             let has_room = self.runs.len() < MAX_RUNS && peer.vehicle() == peer;
@@ -445,7 +445,7 @@ impl LeadershipNode {
 
     /// Records an accepted round. Only rounds of the election's own epoch are evidence, because any
     /// client of a broker can publish rounds of other epochs.
-    fn take_round(&mut self, epoch: Epoch, round: u64, now: Timestamp) {
+    fn on_round(&mut self, epoch: Epoch, round: u64, now: Timestamp) {
         if self.election.epoch() == Some(&epoch) {
             self.feed(
                 ElectionInput::Round {
@@ -460,7 +460,7 @@ impl LeadershipNode {
 
     /// Processes a check. The list of members compensates for events before the start, and for
     /// members that a restarted membership lost without an event.
-    fn take_look(
+    fn on_check(
         &mut self,
         rounds_due: u64,
         load_percent: u8,
@@ -468,15 +468,15 @@ impl LeadershipNode {
         now: Timestamp,
     ) {
         if !self.is_vehicle_only {
-            self.monitor.note_look(rounds_due, load_percent, now);
+            self.monitor.record_load(rounds_due, load_percent, now);
             self.update_health(now);
         }
         for name in self.members.long_missing(&members, now) {
-            self.part_with(name, now);
+            self.member_down(name, now);
         }
         for member in members {
             if !self.members.knows(&member) {
-                self.meet(member, now);
+                self.member_up(member, now);
             }
         }
         self.check_logins(now);
@@ -507,7 +507,7 @@ impl LeadershipNode {
         };
         let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
         if self.logins.look(&brokers.collect()) {
-            self.tell_logins(now);
+            self.report_logins(now);
         }
         let (without_login, followers) = self.election.followers_without_login();
         let without_login = if self.election.is_leading() {
@@ -527,11 +527,11 @@ impl LeadershipNode {
 
     fn forget_login(&mut self, name: &NodeName, now: Timestamp) {
         if self.logins.forget(name) {
-            self.tell_logins(now);
+            self.report_logins(now);
         }
     }
 
-    fn tell_logins(&mut self, now: Timestamp) {
+    fn report_logins(&mut self, now: Timestamp) {
         let at: Vec<_> = self.logins.missing().cloned().collect();
         self.log(Notice::NoLogin { at: at.clone() });
         self.feed(ElectionInput::NoLogin { at }, now);
@@ -623,8 +623,8 @@ impl LeadershipNode {
     }
 
     /// Returns effects for leadership, links and status if they changed.
-    fn tell(&mut self, now: Timestamp) {
-        self.tell_leadership();
+    fn publish_changes(&mut self, now: Timestamp) {
+        self.publish_leadership();
         let broker = |name: Option<&NodeName>| match name {
             Some(name) if name == self.election.name() => self.own_broker.map(BrokerAddress::from),
             Some(name) => self.members.broker_of(name),
@@ -655,18 +655,18 @@ impl LeadershipNode {
             self.monitor.forget_links_but(&links.brokers);
             self.effects.push(Effect::SetLinks { links });
         }
-        self.tell_status();
+        self.publish_status();
     }
 
-    fn tell_leadership(&mut self) {
+    fn publish_leadership(&mut self) {
         let leadership = Leadership::of(&self.election, self.is_deserted);
         if leadership != self.leadership {
             self.leadership = leadership.clone();
-            self.effects.push(Effect::TellLeadership { leadership });
+            self.effects.push(Effect::PublishLeadership { leadership });
         }
     }
 
-    fn tell_status(&mut self) {
+    fn publish_status(&mut self) {
         let epoch = self.leadership.present_epoch().or(self.accepted.as_ref());
         let state = if self.leadership.is_leading() {
             NodeState::Aggregating

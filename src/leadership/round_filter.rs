@@ -136,7 +136,7 @@ impl RoundFilter {
         self.maps
             .admit(&epoch, map.round, received_at, leadership)?;
         check_age(&mut self.map_age, &epoch, map.fused_at_us, received_at)?;
-        self.note_origin(&epoch, origin);
+        self.record_origin(&epoch, origin);
         self.map_accepted_at = Some(received_at);
         Ok(accepted(epoch, map.round, true, leadership))
     }
@@ -162,7 +162,7 @@ impl RoundFilter {
             verdicts.fused_at_us,
             received_at,
         )?;
-        self.note_origin(&epoch, origin);
+        self.record_origin(&epoch, origin);
         let is_sign_of_life = self
             .map_accepted_at
             .is_none_or(|at| received_at.since(at) >= EPOCH_MEMORY);
@@ -187,7 +187,7 @@ impl RoundFilter {
         self.check_origin(&epoch, origin)?;
         self.reputations
             .admit(&epoch, reputations.round, received_at, leadership)?;
-        self.note_origin(&epoch, origin);
+        self.record_origin(&epoch, origin);
         Ok(accepted(epoch, reputations.round, false, leadership))
     }
 
@@ -200,7 +200,7 @@ impl RoundFilter {
         }
     }
 
-    fn note_origin(&mut self, epoch: &Epoch, origin: Origin) {
+    fn record_origin(&mut self, epoch: &Epoch, origin: Origin) {
         if origin == Origin::Proven && self.proven.as_ref() != Some(epoch) {
             self.proven = Some(epoch.clone());
         }

@@ -25,7 +25,7 @@ pub struct ReputationLedger {
     /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
     /// Signed shares on probation, by lane, and when the probation ends.
-    pub(super) on_trial: BTreeMap<Epoch, (Statements, Timestamp)>,
+    pub(super) on_probation: BTreeMap<Epoch, (Statements, Timestamp)>,
     /// Time of the last reset, in cells without certificates; 0 without a reset.
     pub(super) reset_at: Timestamp,
 }

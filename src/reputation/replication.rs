@@ -307,7 +307,7 @@ impl ReputationLedger {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);
         self.statements.remove(lane);
-        self.on_trial.remove(lane);
+        self.on_probation.remove(lane);
     }
 
     /// Records that the number of counts and marks of an aggregator changed from `before` to

@@ -42,9 +42,9 @@ impl ReputationLedger {
         let changed = self.merge_share(share, present);
         if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
             let size = self.size_of(&lane);
-            let on_trial = self.on_trial.entry(lane).or_default();
-            keep(&mut on_trial.0, share, size);
-            on_trial.1 = ends_at;
+            let on_probation = self.on_probation.entry(lane).or_default();
+            keep(&mut on_probation.0, share, size);
+            on_probation.1 = ends_at;
         }
         changed
     }
@@ -58,7 +58,7 @@ impl ReputationLedger {
         has_failed: impl Fn(&Epoch) -> bool,
     ) -> Vec<(Epoch, bool)> {
         let mut ended = Vec::new();
-        for (lane, (tried, ends_at)) in std::mem::take(&mut self.on_trial) {
+        for (lane, (tried, ends_at)) in std::mem::take(&mut self.on_probation) {
             if has_failed(&lane) {
                 let kept = self
                     .statements
@@ -76,7 +76,7 @@ impl ReputationLedger {
                     .for_each(|share| _ = self.merge_statement(share, None));
                 ended.push((lane, true));
             } else {
-                self.on_trial.insert(lane, (tried, ends_at));
+                self.on_probation.insert(lane, (tried, ends_at));
             }
         }
         ended
@@ -89,7 +89,7 @@ impl ReputationLedger {
 
     /// True if the counts of a lane come from signed shares. This node's own counts do not.
     pub fn is_stated(&self, lane: &Epoch) -> bool {
-        self.statements.contains_key(lane) || self.on_trial.contains_key(lane)
+        self.statements.contains_key(lane) || self.on_probation.contains_key(lane)
     }
 
     /// Drops this node's own counts, under the name `aggregator`; returns true if there were any.
@@ -107,7 +107,7 @@ impl ReputationLedger {
         let lanes: BTreeSet<_> = self
             .statements
             .keys()
-            .chain(self.on_trial.keys())
+            .chain(self.on_probation.keys())
             .cloned()
             .collect();
         for lane in lanes {
@@ -116,7 +116,7 @@ impl ReputationLedger {
                 .get(&lane)
                 .map(|lane| lane.signed.clone())
                 .unwrap_or_default();
-            let (tried, ends_at) = self.on_trial.get(&lane).cloned().unwrap_or_default();
+            let (tried, ends_at) = self.on_probation.get(&lane).cloned().unwrap_or_default();
             if signed
                 .iter()
                 .chain(&tried.signed)

@@ -55,15 +55,15 @@ const MAX_RENAMES: u8 = 2;
 
 /// Objects of neighbouring cells, and trust in the cells.
 #[derive(Debug, Clone, Default)]
-pub(super) struct ForeignObjects {
-    objects: Vec<ForeignObject>,
+pub(super) struct NeighbourTracks {
+    objects: Vec<NeighbourTrack>,
     trust: DormantCounts,
     pub(super) hand_overs: HandOvers,
 }
 
 /// An object of a neighbouring cell.
 #[derive(Debug, Clone)]
-pub(super) struct ForeignObject {
+pub(super) struct NeighbourTrack {
     cell: NodeName,
     /// The object as a track; its history has the observations of this cell's vehicles.
     pub(super) track: Track,
@@ -75,7 +75,7 @@ pub(super) struct ForeignObject {
     same: Option<(Uuid, Timestamp)>,
 }
 
-impl ForeignObject {
+impl NeighbourTrack {
     fn new(stated: &NeighbourObject, fused_at: Timestamp, config: &TracksConfig) -> Self {
         let NeighbourObject { cell, object, .. } = stated;
         let mut track = Track::new(
@@ -131,10 +131,10 @@ impl ForeignObject {
     }
 }
 
-impl ForeignObjects {
+impl NeighbourTracks {
     /// Replaces all objects of neighbouring cells; their ages are relative to `stated_at`. Tracks that match an older
     /// object take over its identity.
-    pub(super) fn take(
+    pub(super) fn on_neighbours(
         &mut self,
         stated: &[NeighbourObject],
         stated_at: Timestamp,
@@ -147,7 +147,7 @@ impl ForeignObjects {
             .iter()
             .map(|stated| {
                 let fused_at = stated_at - Duration::from_secs_f64(stated.age_s.clamp(0.0, 60.0));
-                let mut object = ForeignObject::new(stated, fused_at, config);
+                let mut object = NeighbourTrack::new(stated, fused_at, config);
                 let of_cell = || known.iter().filter(|known| known.cell == stated.cell);
                 let by_id = of_cell().find(|known| known.track.id == stated.object.id);
                 // An object whose identity changes in every map is judged nevertheless.
@@ -254,7 +254,7 @@ impl ForeignObjects {
 
     /// True if an object is not published, because it matches a track of this cell or its cell is distrusted.
     pub(super) fn hides(&self, stated: &NeighbourObject, fleet: &Fleet) -> bool {
-        let is_this = |object: &&ForeignObject| {
+        let is_this = |object: &&NeighbourTrack| {
             object.track.id == stated.object.id && object.cell == stated.cell
         };
         let is_same = self
@@ -325,7 +325,7 @@ impl ForeignObjects {
         tracks: &TrackStore,
         fleet: &Fleet,
         config: &TracksConfig,
-    ) -> Option<&ForeignObject> {
+    ) -> Option<&NeighbourTrack> {
         let candidates = self.objects.iter().filter(|object| object.same.is_none());
         let near = candidates.filter_map(|object| {
             let innovation = object.track.state.innovation(at, measurement);
@@ -350,7 +350,7 @@ impl ForeignObjects {
     }
 }
 
-impl ForeignObject {
+impl NeighbourTrack {
     /// A track that begins with a measurement of this object at `at`.
     pub(super) fn lend(
         &self,

@@ -30,7 +30,7 @@ impl Gauge {
     }
 
     /// Records an observer's error before the estimate is updated, and the part of it that remains after decay.
-    pub(super) fn note(&mut self, sensor: SensorId, error: Vector4<f64>, kept: f64) {
+    pub(super) fn record(&mut self, sensor: SensorId, error: Vector4<f64>, kept: f64) {
         self.group(sensor.number());
         self.before[sensor.number()].get_or_insert((error, 1.0)).1 *= kept;
     }

@@ -64,7 +64,7 @@ pub(super) fn register(
             let kept = sensor
                 .pose_bias
                 .observe(frame.at, frame.delay_s, &pairs, &prior);
-            gauge.note(frame.sensor, error, kept);
+            gauge.record(frame.sensor, error, kept);
         }
     }
     gauge.hold(sensors, &prior);

@@ -58,7 +58,7 @@ impl Sensors {
     }
 
     /// The model of a reporting vehicle, created for a new vehicle, and the fleet.
-    pub(super) fn hear(
+    pub(super) fn receive(
         &mut self,
         node: &NodeName,
         at: Timestamp,

@@ -117,7 +117,7 @@ impl TrackStore {
         let index = TrackIndex(self.tracks.len() as u32);
         self.grid.insert(track.indexed(index, self.indexed_at));
         self.tracks.push(track);
-        self.note_speed(index);
+        self.record_speed(index);
         Some(index)
     }
 
@@ -177,7 +177,7 @@ impl TrackStore {
     }
 
     /// Records that a track's velocity has changed.
-    pub(super) fn note_speed(&mut self, index: TrackIndex) {
+    pub(super) fn record_speed(&mut self, index: TrackIndex) {
         self.fastest_mps = self.fastest_mps.max(self[index].state.velocity.norm());
     }
 

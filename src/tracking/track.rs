@@ -201,7 +201,7 @@ impl Track {
     }
 
     /// Records whether any vehicle detects the object at `at`.
-    pub(super) fn note_detected(&mut self, at: Timestamp) {
+    pub(super) fn record_detected(&mut self, at: Timestamp) {
         self.is_detected = self.history.iter().any(|history| {
             history.state.is_hit() && at.since(history.last_look) <= DETECTED_WITHIN
         });

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::config::TracksConfig;
-use super::foreign::ForeignObjects;
+use super::foreign::NeighbourTracks;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::population::Population;
 use super::registration::{RegistrationFrame, register};
@@ -28,7 +28,7 @@ pub struct Tracker {
     config: TracksConfig,
     pub(super) sensors: Sensors,
     tracks: TrackStore,
-    foreign: ForeignObjects,
+    foreign: NeighbourTracks,
     population: Population,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
@@ -48,7 +48,7 @@ impl Tracker {
         Self {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
-            foreign: ForeignObjects::default(),
+            foreign: NeighbourTracks::default(),
             population: Population::default(),
             config,
             pending: Vec::new(),
@@ -121,8 +121,8 @@ impl Tracker {
 
     /// Replaces all objects of neighbouring cells; their ages are relative to `stated_at`, and their times use its
     /// clock. A turning frame has no position on Earth and no neighbours.
-    pub fn take_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
-        self.foreign.take(
+    pub fn on_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
+        self.foreign.on_neighbours(
             objects,
             stated_at,
             &mut self.tracks,
@@ -164,7 +164,7 @@ impl Tracker {
         let pending = std::mem::take(&mut self.pending);
         let oldest_capture = pending.iter().map(|(captured_at, _)| *captured_at).min();
         for (at, report) in &pending {
-            self.frame.note(report, *at);
+            self.frame.record(report, *at);
         }
         let trust = |node: &NodeName| {
             self.sensors

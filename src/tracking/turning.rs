@@ -30,7 +30,7 @@ pub(super) struct TurningFrame {
 
 impl TurningFrame {
     /// Records the yaw rate that a report states, captured at `at`.
-    pub(super) fn note(&mut self, report: &ObjectReport, at: Timestamp) {
+    pub(super) fn record(&mut self, report: &ObjectReport, at: Timestamp) {
         let latest = (at, report.seq, report.frame_yaw_rate_radps.unwrap_or(0.0));
         let known = self.stated.entry(report.node.clone()).or_insert(latest);
         if (latest.0, latest.1) > (known.0, known.1) {

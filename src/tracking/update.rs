@@ -10,7 +10,7 @@ use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::existence::{ExistenceStatement, LookRates, LookState, logistic};
-use super::foreign::ForeignObjects;
+use super::foreign::NeighbourTracks;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
@@ -68,7 +68,7 @@ pub(super) struct InstantUpdate<'a> {
     pub(super) config: &'a TracksConfig,
     pub(super) tracks: &'a mut TrackStore,
     pub(super) sensors: &'a mut Sensors,
-    pub(super) foreign: &'a mut ForeignObjects,
+    pub(super) foreign: &'a mut NeighbourTracks,
     pub(super) population: &'a mut Population,
     pub(super) at: Timestamp,
 }
@@ -81,7 +81,7 @@ impl InstantUpdate<'_> {
     ) -> InstantOutcome {
         let mut scans = Vec::new();
         for (report, delay_s) in reports {
-            let (sensor, fleet) = self.sensors.hear(&report.node, self.at, self.config);
+            let (sensor, fleet) = self.sensors.receive(&report.node, self.at, self.config);
             let id = sensor.id;
             let trust = fleet.trust(sensor.id);
             let has_jumped = sensor.observe(report, self.at, self.config);
@@ -172,8 +172,8 @@ impl InstantUpdate<'_> {
         if let Some(history) = track.history.for_hit(vehicle, at) {
             history.hit(at, measurement.position, OWN_NATS, OWN_NATS);
         }
-        track.note_detected(at);
-        self.tracks.note_speed(index);
+        track.record_detected(at);
+        self.tracks.record_speed(index);
     }
 
     /// All observations of the instant: detections, and misses of the tracks in view.
@@ -350,7 +350,7 @@ impl InstantUpdate<'_> {
                 }
             }
         }
-        self.tracks.note_speed(index);
+        self.tracks.record_speed(index);
     }
 
     /// Adds all observations to the existences, then updates rates, calibrations and judgements.
@@ -399,7 +399,7 @@ impl InstantUpdate<'_> {
         seen.sort_unstable();
         seen.dedup();
         for track in seen {
-            self.tracks[track].note_detected(at);
+            self.tracks[track].record_detected(at);
         }
         for look in looks {
             self.learn(look, &scans[look.scan]);

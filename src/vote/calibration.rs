@@ -136,7 +136,7 @@ impl ConfidenceCalibration {
     }
 
     /// Replaces the live evidence by the live evidence of `other`.
-    pub(super) fn take_live(&mut self, other: Self) {
+    pub(super) fn merge_live(&mut self, other: Self) {
         self.live = other.live;
     }
 

@@ -202,7 +202,7 @@ impl LandmarkVotes {
 
     /// Stores an evaluation, and adds to the evidence on confidences how probable the others make
     /// the label of each vote.
-    pub(super) fn take(
+    pub(super) fn adopt_posterior(
         &mut self,
         judged: LandmarkPosterior,
         calibration: &mut ConfidenceCalibration,

@@ -115,7 +115,7 @@ impl WeightedVoting {
         self.model.refresh(votes.iter().map(|vote| vote.vehicle));
         let candidates = landmark_votes.candidates();
         let judged = self.model.judge(&votes, &candidates);
-        landmark_votes.take(judged, &mut self.calibration);
+        landmark_votes.adopt_posterior(judged, &mut self.calibration);
         self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         landmark_votes.counted = true;
         landmark_votes.publish(self.config.hysteresis);

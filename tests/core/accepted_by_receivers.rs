@@ -262,7 +262,7 @@ proptest! {
             let about = (index % 5 > 0).then_some(about.as_str());
             // One remedy is another node's text.
             let remedy = if kind == TroubleKind::ReportsRefused { cause } else { kind.remedy() };
-            register.note_with(kind, about, || cause.clone(), remedy, at(1));
+            register.record_with(kind, about, || cause.clone(), remedy, at(1));
         }
         let node = NodeName::new("x".repeat(64)).unwrap();
         let mut status = NodeStatus::starting(node.clone(), Uuid::nil(), Role::Edge, "0.1.0");

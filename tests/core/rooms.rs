@@ -329,7 +329,7 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     /// Notes the module that a path leads to.
-    fn note(&mut self, path: &[String]) {
+    fn record(&mut self, path: &[String]) {
         let Some(first) = path.first() else { return };
         let mut target = match first.as_str() {
             "crate" => vec![self.module[0].clone()],
@@ -359,9 +359,9 @@ impl Reader<'_> {
         let with = |name: &syn::Ident| [before, &[name.to_string()]].concat();
         match tree {
             syn::UseTree::Path(path) => self.note_tree(&with(&path.ident), &path.tree),
-            syn::UseTree::Name(name) => self.note(&with(&name.ident)),
-            syn::UseTree::Rename(rename) => self.note(&with(&rename.ident)),
-            syn::UseTree::Glob(_) => self.note(before),
+            syn::UseTree::Name(name) => self.record(&with(&name.ident)),
+            syn::UseTree::Rename(rename) => self.record(&with(&rename.ident)),
+            syn::UseTree::Glob(_) => self.record(before),
             syn::UseTree::Group(group) => group
                 .items
                 .iter()
@@ -382,7 +382,7 @@ impl<'ast> Visit<'ast> for Reader<'_> {
             .map(|segment| segment.ident.to_string())
             .collect();
         if names.len() > 1 {
-            self.note(&names);
+            self.record(&names);
         }
         visit::visit_path(self, path);
     }

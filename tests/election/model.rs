@@ -249,7 +249,7 @@ impl Cell {
         let node = &mut self.nodes[index];
         match effect {
             Effect::PersistTerm { term } => node.persisted = term,
-            Effect::TellLeadership { leadership } => node.leadership = leadership,
+            Effect::PublishLeadership { leadership } => node.leadership = leadership,
             Effect::Lead {
                 epoch, first_round, ..
             } => {

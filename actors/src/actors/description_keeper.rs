@@ -125,7 +125,7 @@ impl Actor for DescriptionKeeper {
         let mut writer = StateWriter::new(file, DESCRIPTION);
         if held.is_some() {
             // A description with which the node was started is not on disk yet.
-            writer.note_change();
+            writer.record_change();
         }
         Ok(DescriptionKeeperState {
             exchange: DescriptionExchange::new(name.clone(), may_lead, history),
@@ -160,10 +160,10 @@ impl Actor for DescriptionKeeper {
                 may_lead,
                 may_describe,
                 stamp,
-            } => state.hear(&from, may_lead, may_describe, stamp, now),
-            DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => {
-                state.exchange.take(Arc::clone(&delivery.message), now)
-            }
+            } => state.receive(&from, may_lead, may_describe, stamp, now),
+            DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => state
+                .exchange
+                .on_description(Arc::clone(&delivery.message), now),
             DescriptionKeeperMessage::Take { delivery } => {
                 let broker = delivery.broker.as_ref().map_or(OTHERS, NodeName::as_str);
                 state.counters.reject(RejectReason::Malformed, broker);
@@ -202,7 +202,7 @@ impl Actor for DescriptionKeeper {
 impl DescriptionKeeperState {
     /// Processes a node's statement. With certificates, a statement counts only together with its
     /// certificate, by which it can be revoked.
-    fn hear(
+    fn receive(
         &mut self,
         from: &NodeName,
         may_lead: bool,
@@ -219,7 +219,7 @@ impl DescriptionKeeperState {
         if self.credentials.is_some() && certificate.is_none() {
             return Vec::new();
         }
-        self.exchange.hear(
+        self.exchange.receive(
             from,
             DescriptionStatement {
                 stamp,
@@ -279,7 +279,7 @@ impl DescriptionKeeperState {
                     let stamp = description.stamp();
                     let set_by = &description.set_by;
                     tracing::info!(%stamp, %set_by, %stated_by, "the cell has a new description");
-                    self.writer.note_change();
+                    self.writer.record_change();
                     (self.apply)(description);
                 }
                 DescriptionEffect::Publish { description } => {
@@ -303,7 +303,7 @@ impl DescriptionKeeperState {
                 SaveOutcome::Failed => {
                     let cause =
                         "it cannot be saved, and is learnt anew from other nodes after a restart";
-                    troubles.note_about(DESCRIPTION, TroubleKind::NotSaved, cause);
+                    troubles.record_about(DESCRIPTION, TroubleKind::NotSaved, cause);
                 }
             }
         }

@@ -230,7 +230,9 @@ impl Actor for Detector {
             }
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
-                state.troubles.note(TroubleKind::Camera, &error.to_string());
+                state
+                    .troubles
+                    .record(TroubleKind::Camera, &error.to_string());
                 state.failing = true;
             }
         }
@@ -255,7 +257,7 @@ impl DetectorState {
                 took.as_secs_f64(),
                 self.max_age.as_secs_f64()
             );
-            self.troubles.note(TroubleKind::DetectorSlow, &cause);
+            self.troubles.record(TroubleKind::DetectorSlow, &cause);
         }
     }
 
@@ -265,7 +267,9 @@ impl DetectorState {
         let scaled = self.lens.fitted(frame, detections);
         let mismatch = scaled.as_ref().err().copied();
         match &mismatch {
-            Some(error) => self.troubles.note(TroubleKind::Camera, &error.to_string()),
+            Some(error) => self
+                .troubles
+                .record(TroubleKind::Camera, &error.to_string()),
             None if self.mismatch.is_some() => self.troubles.settle(TroubleKind::Camera),
             None => {}
         }
@@ -293,7 +297,7 @@ async fn pump(
             match timeout(SLOW_AFTER, &mut ready).await {
                 Ok(Ok(permit)) => break permit,
                 Ok(Err(_)) => return,
-                Err(_) => troubles.note(TroubleKind::DetectorSlow, SLOW_DETECTOR),
+                Err(_) => troubles.record(TroubleKind::DetectorSlow, SLOW_DETECTOR),
             }
         };
         let frame = loop {
@@ -313,7 +317,7 @@ async fn pump(
             }
             match &*status.borrow() {
                 CaptureStatus::Failed { error, .. } => {
-                    troubles.note(
+                    troubles.record(
                         TroubleKind::Camera,
                         &format!("the camera gives no frames: {error}"),
                     );
@@ -323,7 +327,7 @@ async fn pump(
             }
         };
         let Some(frame) = frame else {
-            troubles.note(
+            troubles.record(
                 TroubleKind::Camera,
                 "the camera's frames have ended: set `looping` of its source, or another source",
             );

@@ -109,15 +109,15 @@ impl Actor for Follower {
     ) -> Result<(), ActorProcessingErr> {
         let (taken, sender) = match message {
             FollowerMessage::TakeMap { delivery } => (
-                state.take_map(&delivery),
+                state.on_map(&delivery),
                 Some(delivery.message.aggregator.clone()),
             ),
             FollowerMessage::TakeVerdicts { delivery } => (
-                state.take_verdicts(&delivery),
+                state.on_verdicts(&delivery),
                 Some(delivery.message.aggregator.clone()),
             ),
             FollowerMessage::TakeReputations { delivery } => (
-                state.take_reputations(&delivery),
+                state.on_reputations(&delivery),
                 delivery.message.aggregator.clone(),
             ),
         };
@@ -170,7 +170,7 @@ impl FollowerState {
         }
     }
 
-    fn take_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
+    fn on_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
         let Delivery {
             message: map,
             origin,
@@ -189,7 +189,7 @@ impl FollowerState {
                 received_at,
             });
         }
-        self.tell_election(accepted);
+        self.notify_election(accepted);
         let received = ReceivedMap {
             received_at,
             map: Arc::clone(map),
@@ -209,7 +209,7 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_verdicts(&mut self, delivery: &Delivery<Arc<Verdicts>>) -> Result<(), Refusal> {
+    fn on_verdicts(&mut self, delivery: &Delivery<Arc<Verdicts>>) -> Result<(), Refusal> {
         let Delivery {
             message: verdicts,
             origin,
@@ -227,7 +227,7 @@ impl FollowerState {
         self.counters.count(Event::VerdictsAccepted);
         self.recording
             .send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
-        self.tell_election(accepted);
+        self.notify_election(accepted);
         self.newest.verdicts.send_replace(Some(Received {
             received_at,
             message: Arc::clone(verdicts),
@@ -236,7 +236,7 @@ impl FollowerState {
         Ok(())
     }
 
-    fn take_reputations(&mut self, delivery: &Delivery<Arc<Reputations>>) -> Result<(), Refusal> {
+    fn on_reputations(&mut self, delivery: &Delivery<Arc<Reputations>>) -> Result<(), Refusal> {
         let Delivery {
             message: reputations,
             origin,
@@ -261,7 +261,7 @@ impl FollowerState {
         Ok(())
     }
 
-    fn tell_election(&self, accepted: AcceptedRound) {
+    fn notify_election(&self, accepted: AcceptedRound) {
         let AcceptedRound {
             epoch,
             round,

@@ -115,15 +115,15 @@ impl Actor for Fuser {
     ) -> Result<(), ActorProcessingErr> {
         state.follow_clock();
         match message {
-            FuserMessage::TakeReports => state.take_reports(),
-            FuserMessage::TakeMap { map, received_at } => state.take_map(map, received_at),
+            FuserMessage::TakeReports => state.drain_reports(),
+            FuserMessage::TakeMap { map, received_at } => state.on_map(map, received_at),
             FuserMessage::Expel { node } => state.expel(&node),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
                 state.alarm = Timestamp(u64::MAX);
                 // Drains the queue: after a restart it may contain reports whose notification the
                 // former run consumed.
-                state.take_reports();
+                state.drain_reports();
                 state.tick();
             }
             FuserMessage::Lead {
@@ -240,13 +240,13 @@ impl FuserState {
         }
     }
 
-    fn take_reports(&mut self) {
+    fn drain_reports(&mut self) {
         for delivery in self.report_queue.drain() {
-            self.take(&delivery);
+            self.on_delivery(&delivery);
         }
     }
 
-    fn take(&mut self, delivery: &Delivery<QueuedReport>) {
+    fn on_delivery(&mut self, delivery: &Delivery<QueuedReport>) {
         let QueuedReport { kind, report } = &delivery.message;
         self.recording.send(
             delivery.received_at,
@@ -256,24 +256,24 @@ impl FuserState {
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
             Ok(fused) => {
-                self.note_clock(report, delivery.received_at);
-                self.note_doubts(*kind, report, delivery.received_at);
+                self.check_clock(report, delivery.received_at);
+                self.report_doubts(*kind, report, delivery.received_at);
                 if self.aggregator.leads().is_some() {
                     self.spans
-                        .note(report, delivery.received_at, &mut self.reports);
+                        .record(report, delivery.received_at, &mut self.reports);
                 }
                 self.publish(fused, delivery.received_at);
             }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
-                self.note_rejection(reason, *kind, report, delivery.received_at);
+                self.record_rejection(reason, *kind, report, delivery.received_at);
             }
         }
     }
 
     /// Counts a report that was not used. Reports that are repeatedly refused because of their time
     /// are a trouble.
-    fn note_rejection(
+    fn record_rejection(
         &self,
         reason: RejectReason,
         kind: ReportKind,
@@ -304,7 +304,7 @@ impl FuserState {
                     } else {
                         TroubleKind::Untimely.remedy()
                     };
-                    self.counters.troubles().note_with_remedy(
+                    self.counters.troubles().record_with_remedy(
                         Some(node),
                         TroubleKind::Untimely,
                         &cause,
@@ -322,7 +322,7 @@ impl FuserState {
     }
 
     /// Records a trouble if a sender's clock is wrong although its reports are corrected.
-    fn note_clock(&self, report: &ObjectReport, received_at: Timestamp) {
+    fn check_clock(&self, report: &ObjectReport, received_at: Timestamp) {
         let lead_us = self.lead_us(report, received_at);
         if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
             let cause = format!(
@@ -335,12 +335,12 @@ impl FuserState {
                 .settle(TroubleKind::Untimely, Some(node));
             self.counters
                 .troubles()
-                .note_about(node, TroubleKind::ClockOff, &cause);
+                .record_about(node, TroubleKind::ClockOff, &cause);
         }
     }
 
     /// Records doubts about a report that was used.
-    fn note_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
+    fn report_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
         for doubt in self.aggregator.doubts(kind, report, received_at) {
             let trouble = match doubt {
                 ReportDoubt::FarObject { .. }
@@ -348,9 +348,11 @@ impl FuserState {
                 | ReportDoubt::Moves => TroubleKind::Misplaced,
                 ReportDoubt::SharedName => TroubleKind::NameTaken,
             };
-            self.counters
-                .troubles()
-                .note_about(report.node.as_str(), trouble, &doubt.to_string());
+            self.counters.troubles().record_about(
+                report.node.as_str(),
+                trouble,
+                &doubt.to_string(),
+            );
         }
     }
 
@@ -379,20 +381,20 @@ impl FuserState {
             Some(true) => {}
             Some(false) => {
                 let cause = format!("names the location “{id}”, which this node does not know");
-                troubles.note_about(node, TroubleKind::UnknownLocation, &cause);
+                troubles.record_about(node, TroubleKind::UnknownLocation, &cause);
             }
             // Votes name locations themselves where no list is configured.
             None if kind == ReportKind::VoteDetections => {}
             None => {
                 let cause =
                     format!("{node} names known locations, such as “{id}”, and this node has none");
-                troubles.note(TroubleKind::NoLocations, &cause);
+                troubles.record(TroubleKind::NoLocations, &cause);
             }
         }
     }
 
     /// Stores the map that was accepted last, to continue from it when this node leads.
-    fn take_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
+    fn on_map(&mut self, map: Arc<GlobalMap>, received_at: Timestamp) {
         if self.aggregator.leads().is_none() {
             self.last_map = Some((map, received_at));
         }
@@ -515,7 +517,7 @@ impl FuserState {
             };
             for vehicle in contributors {
                 let troubles = self.counters.troubles();
-                troubles.note_about_with(vehicle.as_str(), kind, || match kind {
+                troubles.record_about_with(vehicle.as_str(), kind, || match kind {
                     TroubleKind::Overload => {
                         "the map leaves out objects that only it reports: it has more than its share"
                             .to_owned()

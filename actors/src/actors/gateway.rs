@@ -403,7 +403,7 @@ impl GatewayState {
         for (link, reports) in self.links.values_mut().zip(reports) {
             if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
                 link.state = LinkState::Stalled;
-                tell_state(&self.inbox, link);
+                publish_state(&self.inbox, link);
             }
         }
     }
@@ -494,7 +494,7 @@ impl GatewayState {
         };
         if link.state != state {
             link.state = state;
-            tell_state(&self.inbox, link);
+            publish_state(&self.inbox, link);
         }
     }
 }
@@ -506,7 +506,7 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 }
 
 /// Delivers the new state of a link to this node's actors.
-fn tell_state(inbox: &Inbox, link: &Link) {
+fn publish_state(inbox: &Inbox, link: &Link) {
     let broker = link.broker.clone();
     let state = link.state;
     tracing::info!(%broker, %state, "link changed");

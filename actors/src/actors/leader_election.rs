@@ -133,9 +133,9 @@ impl Actor for LeaderElection {
         driver: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            LeaderElectionMessage::Membership { event } => driver.take_event(event).await,
+            LeaderElectionMessage::Membership { event } => driver.on_membership_event(event).await,
             LeaderElectionMessage::TakeStatus { delivery } => {
-                driver.take_status(&delivery.message).await;
+                driver.on_status(&delivery.message).await;
             }
             LeaderElectionMessage::Note { input } => driver.handle(input).await,
         }

@@ -222,11 +222,11 @@ impl Actor for Membership {
                 {
                     state.machine.set_identity(identity, now);
                     // Nodes may have shown renewed certificates, for which there is no event.
-                    state.tell_members();
+                    state.publish_members();
                 }
                 let renewals = state.renewals.as_mut();
                 let step = renewals.and_then(|renewals| renewals.check(now));
-                state.take_step(step);
+                state.on_renewal_step(step);
             }
             MembershipMessage::Renewal { outcome } => {
                 if matches!(outcome, RenewalOutcome::Answered { answer: Err(_), .. }) {
@@ -234,7 +234,7 @@ impl Actor for Membership {
                 }
                 let renewals = state.renewals.as_mut();
                 let step = renewals.and_then(|renewals| renewals.on_outcome(outcome));
-                state.take_step(step);
+                state.on_renewal_step(step);
             }
             MembershipMessage::Wake => state.wake(),
         }
@@ -293,7 +293,7 @@ impl MembershipState {
             }
         }
         if changed {
-            self.tell_members();
+            self.publish_members();
         }
         self.deadline.send_replace(self.machine.next_deadline());
     }
@@ -306,16 +306,16 @@ impl MembershipState {
         let renewals = self.renewals.as_mut();
         let step = renewals
             .and_then(|renewals| renewals.on_message(from, certificate, message, clock::now()));
-        self.take_step(step);
+        self.on_renewal_step(step);
     }
 
-    fn take_step(&mut self, step: Option<RenewalStep>) {
+    fn on_renewal_step(&mut self, step: Option<RenewalStep>) {
         match step {
             Some(RenewalStep::Send(to, message)) if to == self.name => {
                 let renewals = self.renewals.as_mut();
                 let step = renewals
                     .and_then(|renewals| renewals.on_message(to, &[], message, clock::now()));
-                self.take_step(step);
+                self.on_renewal_step(step);
             }
             Some(RenewalStep::Send(to, message)) => self.send_renewal(&to, &message),
             Some(RenewalStep::SendToAll(message)) => {
@@ -344,7 +344,7 @@ impl MembershipState {
         }
     }
 
-    fn tell_members(&self) {
+    fn publish_members(&self) {
         let members = self.machine.members();
         self.members.send_if_modified(|told| {
             let has_changed = *told != members;

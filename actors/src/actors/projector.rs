@@ -122,7 +122,7 @@ impl Actor for Projector {
             counters,
         };
         for (at, pose) in recent_poses {
-            state.take_pose(at, &pose);
+            state.on_pose(at, &pose);
         }
         Ok(state)
     }
@@ -162,7 +162,7 @@ impl Actor for Projector {
                 state.algorithms = algorithms;
                 state.move_to(origin);
             }
-            ProjectorMessage::TakePose { at, pose } => state.take_pose(at, &pose),
+            ProjectorMessage::TakePose { at, pose } => state.on_pose(at, &pose),
         }
         Ok(())
     }
@@ -178,7 +178,7 @@ impl ProjectorState {
         }
     }
 
-    fn take_pose(&mut self, at: Timestamp, stated: &StatedPose) {
+    fn on_pose(&mut self, at: Timestamp, stated: &StatedPose) {
         let Some(poses) = &mut self.poses else { return };
         let is_taken = match stated.in_map(self.origin.as_ref()) {
             Ok(pose) => poses.push(at, pose),
@@ -208,7 +208,7 @@ impl ProjectorState {
             .as_ref()
             .map_or(self.standing, |poses| poses.at(captured_at));
         let Some(pose) = pose else {
-            self.troubles.note(
+            self.troubles.record(
                 TroubleKind::NoPose,
                 "no pose is known near the time of the camera's frames",
             );
@@ -237,13 +237,13 @@ impl ProjectorState {
             (found - report.objects.len()) as u64,
         );
         if let Some(cause) = self.perception.without_size() {
-            self.troubles.note(TroubleKind::NoSize, &cause);
+            self.troubles.record(TroubleKind::NoSize, &cause);
         }
         if let Some(cause) = self.perception.nothing_placed() {
-            self.troubles.note(TroubleKind::NotPlaced, &cause);
+            self.troubles.record(TroubleKind::NotPlaced, &cause);
         }
         if let Some(cause) = self.perception.mount_mismatch() {
-            self.troubles.note(TroubleKind::MountMismatch, &cause);
+            self.troubles.record(TroubleKind::MountMismatch, &cause);
         }
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, report.votes());

@@ -194,7 +194,7 @@ impl ReputationKeeperState {
         let credentials = arguments.credentials.clone();
         let mut writer = StateWriter::new(arguments.file.clone(), "reputations");
         // An earlier run may have left unsaved changes.
-        writer.note_change();
+        writer.record_change();
         let resync = if credentials.is_some() {
             LedgerResync::signed
         } else {
@@ -252,7 +252,7 @@ impl ReputationKeeperState {
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     ) {
         if !evidence.is_empty() || reputations.is_some() {
-            self.writer.note_change();
+            self.writer.record_change();
         }
         let mut store = self.arguments.reputations.open();
         let shares = self.resync.record(epoch, evidence, &mut store.ledger);
@@ -317,7 +317,7 @@ impl ReputationKeeperState {
         }
         if merged.is_news {
             self.arguments.counters.count(Event::LedgerMerged);
-            self.writer.note_change();
+            self.writer.record_change();
             self.unadopted = true;
         }
         self.publish_shares(merged.shares);
@@ -342,7 +342,7 @@ impl ReputationKeeperState {
         );
         if passed.is_news {
             tracing::debug!("probation of a leader's evidence about itself has ended");
-            self.writer.note_change();
+            self.writer.record_change();
             self.unadopted = true;
         }
         self.settle().await;
@@ -434,7 +434,7 @@ impl ReputationKeeperState {
                 lanes = store.ledger.lanes(),
                 "evidence of revoked nodes dropped"
             );
-            self.writer.note_change();
+            self.writer.record_change();
             self.unadopted = true;
         }
         has_dropped
@@ -462,7 +462,7 @@ impl ReputationKeeperState {
             }
             SaveOutcome::Failed => {
                 counters.count(Event::ReputationsNotSaved);
-                troubles.note(
+                troubles.record(
                     TroubleKind::NotSaved,
                     "reputations cannot be saved, and end with this node",
                 );

@@ -139,9 +139,9 @@ impl Actor for Uplink {
             } => state.configure(origin, description, &myself),
             UplinkMessage::Take { delivery } => match delivery.message {
                 FromRegion::Map { topic, map } => {
-                    state.take_map(&topic, *map, delivery.received_at);
+                    state.on_map(&topic, *map, delivery.received_at);
                 }
-                FromRegion::Status(status) => state.hear_status(&status),
+                FromRegion::Status(status) => state.on_neighbour_status(&status),
             },
             UplinkMessage::LinkChanged { event } => {
                 let link = state.link.as_mut().filter(|link| link.id() == event.link);
@@ -189,7 +189,7 @@ impl UplinkState {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
         match (leads, self.setup.origin) {
-            (true, None) => troubles.note(TroubleKind::NoOrigin, NO_ORIGIN),
+            (true, None) => troubles.record(TroubleKind::NoOrigin, NO_ORIGIN),
             _ => troubles.settle(TroubleKind::NoOrigin, None),
         }
         match (self.setup.origin.filter(|_| leads), self.link.take()) {
@@ -310,7 +310,7 @@ impl UplinkState {
         }
         let order = Some((map.epoch, map.round));
         if order > std::mem::replace(&mut self.seen, order) {
-            self.tell_neighbours(&map, now);
+            self.publish_to_neighbours(&map, now);
         }
         let (Some(link), Some(origin)) = (&mut self.link, self.setup.origin) else {
             return;
@@ -365,7 +365,7 @@ impl UplinkState {
     }
 
     /// Repeats the node's own status if a last will or a former leader has replaced it.
-    fn hear_status(&mut self, heard: &NodeStatus) {
+    fn on_neighbour_status(&mut self, heard: &NodeStatus) {
         let own = self.own_status();
         let is_former = (heard.epoch, &heard.node) < (own.epoch, &own.node);
         if heard.state == NodeState::Offline || is_former {
@@ -375,7 +375,7 @@ impl UplinkState {
 
     /// Processes the map of another cell; a map that is not accepted is counted by its reason and
     /// cell.
-    fn take_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
+    fn on_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
         let Some(neighbours) = &mut self.neighbours else {
             return;
         };
@@ -395,7 +395,7 @@ impl UplinkState {
                     Event::NeighbourRefused,
                     losses(neighbours).saturating_sub(before),
                 );
-                self.pace.note_neighbour(received_at);
+                self.pace.record_neighbour(received_at);
                 self.has_news = true;
             }
             Err(reason) => self
@@ -413,7 +413,7 @@ impl UplinkState {
 
     /// Sends the objects of other cells to the fuser, once for each own map, so that the next map
     /// contains them.
-    fn tell_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
+    fn publish_to_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
         let Some(neighbours) = &mut self.neighbours else {
             return;
         };

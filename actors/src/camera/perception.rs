@@ -170,7 +170,7 @@ impl Perception {
             .collect();
         self.vehicle_camera.lens.undistort(&mut detections);
         let boxes = detections.iter().zip(cuts.iter().copied());
-        self.mount_off_rad = self.mount_check.take(boxes, captured_at, &self.projection);
+        self.mount_off_rad = self.mount_check.add(boxes, captured_at, &self.projection);
         let all = detections.iter().zip(cuts).enumerate();
         let placed =
             all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));

@@ -156,7 +156,7 @@ impl TryArguments {
             if let Some(path) = &self.output {
                 check_absent(&numbered(path, index)).map_err(Failure::usage)?;
             }
-            apart(config);
+            isolate(config);
             config.dashboard.listen = self.dashboard.filter(|_| index == 0);
             config.validate().map_err(Failure::usage)?;
         }
@@ -220,7 +220,7 @@ fn street() -> anyhow::Result<Vec<NodeConfig>> {
 }
 
 /// Isolates a node of this process in a cell of its own, at unused addresses.
-fn apart(config: &mut NodeConfig) {
+fn isolate(config: &mut NodeConfig) {
     config.cell = NodeName::from_static("try");
     config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
     config.membership.bind = config.listen;

@@ -152,8 +152,8 @@ impl NodeBuilder {
             floor_plan: None,
             failed,
         };
-        builder.note_units();
-        if presence == Presence::Whole {
+        builder.check_units();
+        if presence == Presence::Active {
             builder.take_frames();
         }
         builder.door = builder.new_door();
@@ -272,7 +272,7 @@ impl NodeBuilder {
     /// The parts that this node has, in the order of starting.
     pub(super) fn parts(&self) -> Vec<ActorKind> {
         let leads = self.config.may_lead();
-        let is_whole = self.presence == Presence::Whole;
+        let is_whole = self.presence == Presence::Active;
         let reports = self.presence >= Presence::Reporting;
         let has_broker = self.config.has_broker() && (is_whole || self.config.serves_nodes());
         let mut parts = Vec::new();

@@ -36,11 +36,11 @@ use crate::telemetry::spans::Spans;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Presence {
     /// The node follows the leader, while another node of the vehicle is present in another cell.
-    Beside,
+    Preparing,
     /// It reports, too.
     Reporting,
     /// The node also has page, local broker and log.
-    Whole,
+    Active,
 }
 
 /// Parts and addresses of which a vehicle has one, independent of its cell.
@@ -140,12 +140,12 @@ pub enum MoveStep {
     /// Take over the vehicle's running parts, and report from now on.
     TakeOver,
     /// Start page, local broker and log again.
-    Settle,
+    Activate,
 }
 
 impl SupervisorState {
     /// Carries out a step of the vehicle's change to another cell.
-    pub(super) async fn take_step(
+    pub(super) async fn apply_step(
         &mut self,
         step: MoveStep,
         supervisor: &ActorCell,
@@ -160,7 +160,7 @@ impl SupervisorState {
                 Ok(())
             }
             MoveStep::TakeOver => self.take_over(supervisor).await,
-            MoveStep::Settle => self.advance(Presence::Whole, supervisor).await,
+            MoveStep::Activate => self.advance(Presence::Active, supervisor).await,
         };
         started.inspect_err(|error| self.builder.give_up(NodeError::Failed(error.to_string())))
     }
@@ -189,7 +189,7 @@ impl SupervisorState {
     }
 
     fn hand_over(&mut self, supervisor: &ActorCell) {
-        self.builder.set_presence(Presence::Beside);
+        self.builder.set_presence(Presence::Preparing);
         self.running.retain(|_, part| !part.is_of_vehicle());
         for (_, part) in self.builder.vehicle().running() {
             part.unlink(supervisor.clone());

@@ -71,7 +71,7 @@ impl Roamer {
                 vehicle
                     .counters
                     .troubles()
-                    .note_about(about, TroubleKind::CellLeftOut, &cause);
+                    .record_about(about, TroubleKind::CellLeftOut, &cause);
                 cell.name == config.cell
             }
         });
@@ -79,7 +79,7 @@ impl Roamer {
             cells.iter().map(CellEntry::known).collect(),
             config.cell.clone(),
         );
-        let present = start_with(vehicle.clone(), Presence::Whole, config.clone()).await?;
+        let present = start_with(vehicle.clone(), Presence::Active, config.clone()).await?;
         Ok(Self {
             config,
             cells,
@@ -138,7 +138,7 @@ impl Roamer {
         if place.is_some() {
             self.placed_at = now;
         } else if !self.cells.is_empty() && now.since(self.placed_at) > MAX_POSE_AGE {
-            troubles.note_with_remedy(None, TroubleKind::NoPose, NO_PLACE, PLACE_REMEDY);
+            troubles.record_with_remedy(None, TroubleKind::NoPose, NO_PLACE, PLACE_REMEDY);
         }
         match self.choice.observe(place.as_ref(), now) {
             Some(CellMove::Join(cell)) => self.join(cell).await,
@@ -181,7 +181,7 @@ impl Roamer {
         {
             return self.fail(&cell, &error).await;
         }
-        match start_with(self.vehicle.clone(), Presence::Beside, config).await {
+        match start_with(self.vehicle.clone(), Presence::Preparing, config).await {
             Ok(node) => {
                 self.next = Some((cell, node));
                 Ok(())
@@ -211,7 +211,7 @@ impl Roamer {
         if let Some(former) = self.former.take() {
             former.stop().await;
         }
-        step(&self.present, MoveStep::Settle).await?;
+        step(&self.present, MoveStep::Activate).await?;
         if let Some(manager) = ServiceManager::from_environment() {
             self.present.report_to(manager);
         }
@@ -232,7 +232,7 @@ impl Roamer {
             next.stop().await;
             self.vehicle.counters.troubles().leave_cell();
         }
-        step(&self.present, MoveStep::Settle).await
+        step(&self.present, MoveStep::Activate).await
     }
 }
 

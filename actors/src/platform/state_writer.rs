@@ -45,7 +45,7 @@ impl StateWriter {
     }
 
     /// Makes the next save write the file.
-    pub fn note_change(&mut self) {
+    pub fn record_change(&mut self) {
         self.is_unsaved = true;
     }
 
@@ -125,7 +125,7 @@ mod tests {
         assert_eq!(writer.save(|| 1).await, SaveOutcome::Unchanged);
 
         let (release, hang) = channel();
-        writer.note_change();
+        writer.record_change();
         let begun = Instant::now();
         assert_eq!(
             writer.save(|| Hanging(Mutex::new(hang))).await,

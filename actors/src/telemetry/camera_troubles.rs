@@ -21,13 +21,13 @@ impl CameraTroubles {
     }
 
     /// Records a trouble.
-    pub fn note(&self, kind: TroubleKind, cause: &str) {
+    pub fn record(&self, kind: TroubleKind, cause: &str) {
         match &self.part {
             Some(part) => self
                 .counters
                 .troubles()
-                .note_about(part.as_str(), kind, cause),
-            None => self.counters.troubles().note(kind, cause),
+                .record_about(part.as_str(), kind, cause),
+            None => self.counters.troubles().record(kind, cause),
         }
     }
 

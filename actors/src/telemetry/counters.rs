@@ -212,7 +212,7 @@ impl Counters {
         self.count_reject(reason, source);
         if trouble_of(reason).is_some() {
             self.troubles
-                .note_about_with(source, TroubleKind::MessageRefused, cause);
+                .record_about_with(source, TroubleKind::MessageRefused, cause);
         }
     }
 
@@ -225,7 +225,7 @@ impl Counters {
     ) {
         self.count_reject(reason, source);
         if let Some(kind) = trouble_of(reason) {
-            self.troubles.note_about_with(source, kind, cause);
+            self.troubles.record_about_with(source, kind, cause);
         }
     }
 
@@ -255,7 +255,7 @@ impl Counters {
             _ if !self.floods.is_flood(reason, source, clock::now()) => return,
             _ => "sends more than is taken, the rest is not used",
         };
-        self.troubles.note_about(
+        self.troubles.record_about(
             source,
             TroubleKind::Overload,
             &format!("{cause} ({})", reason.as_str()),
@@ -265,7 +265,7 @@ impl Counters {
     /// Counts a message for a client of the broker whose connection stands still in both directions.
     pub fn shed_cut_off(&self, source: &str) {
         self.shed.count(ShedReason::ReaderSlow, source);
-        self.troubles.note_about(
+        self.troubles.record_about(
             source,
             TroubleKind::NetworkCut,
             "its connection stands still in both directions: the network is cut, or its machine has stopped",

@@ -76,7 +76,12 @@ impl Spans {
     }
 
     /// Records a report that the current round has used.
-    pub fn note(&self, report: &ObjectReport, received_at: Timestamp, reports: &mut RoundReports) {
+    pub fn record(
+        &self,
+        report: &ObjectReport,
+        received_at: Timestamp,
+        reports: &mut RoundReports,
+    ) {
         if span_enabled!(Level::INFO) {
             reports
                 .0

@@ -14,27 +14,34 @@ pub struct Troubles(Mutex<TroubleRegister>);
 
 impl Troubles {
     /// Records a trouble of this node itself.
-    pub fn note(&self, kind: TroubleKind, cause: &str) {
-        let news = self.register().note(kind, None, cause, clock::now());
+    pub fn record(&self, kind: TroubleKind, cause: &str) {
+        let news = self.register().record(kind, None, cause, clock::now());
         log(news);
     }
 
     /// Records a trouble of a vehicle, address or host.
-    pub fn note_about(&self, about: &str, kind: TroubleKind, cause: &str) {
-        let news = self.register().note(kind, Some(about), cause, clock::now());
+    pub fn record_about(&self, about: &str, kind: TroubleKind, cause: &str) {
+        let news = self
+            .register()
+            .record(kind, Some(about), cause, clock::now());
         log(news);
     }
 
-    /// As `note_about`, with a text of the cause that is created only if it is needed.
-    pub fn note_about_with(&self, about: &str, kind: TroubleKind, cause: impl FnOnce() -> String) {
-        let news = self
-            .register()
-            .note_with(kind, Some(about), cause, kind.remedy(), clock::now());
+    /// As `record_about`, with a text of the cause that is created only if it is needed.
+    pub fn record_about_with(
+        &self,
+        about: &str,
+        kind: TroubleKind,
+        cause: impl FnOnce() -> String,
+    ) {
+        let news =
+            self.register()
+                .record_with(kind, Some(about), cause, kind.remedy(), clock::now());
         log(news);
     }
 
     /// Records a trouble of this node itself, or about another, with a remedy of its own.
-    pub fn note_with_remedy(
+    pub fn record_with_remedy(
         &self,
         about: Option<&str>,
         kind: TroubleKind,
@@ -43,7 +50,7 @@ impl Troubles {
     ) {
         let news =
             self.register()
-                .note_with(kind, about, || cause.to_owned(), remedy, clock::now());
+                .record_with(kind, about, || cause.to_owned(), remedy, clock::now());
         log(news);
     }
 

@@ -21,7 +21,7 @@ pub(crate) mod sessions;
 pub(crate) mod socket;
 pub(crate) mod swim;
 #[cfg(any(test, fuzzing))]
-pub(crate) mod trial_authority;
+pub(crate) mod test_authority;
 use std::net::SocketAddr;
 use std::sync::Arc;
 

@@ -50,7 +50,7 @@ impl Service {
     }
 
     /// The next notification of the node, if one arrives until then.
-    fn hear(&self, until: Instant) -> Option<String> {
+    fn receive(&self, until: Instant) -> Option<String> {
         let left = until
             .saturating_duration_since(Instant::now())
             .max(Duration::from_millis(1));
@@ -65,10 +65,10 @@ impl Service {
     }
 
     /// All notifications of the node up to this one.
-    fn hears(&self, wanted: &str) -> Vec<String> {
+    fn receives_from(&self, wanted: &str) -> Vec<String> {
         let deadline = Instant::now() + PATIENCE;
         let mut heard = Vec::new();
-        while let Some(line) = self.hear(deadline) {
+        while let Some(line) = self.receive(deadline) {
             let found = line.starts_with(wanted);
             heard.push(line);
             if found {
@@ -119,24 +119,24 @@ fn watchdog_needs_rounds() {
     std::fs::write(&file, config).unwrap();
     let edge = Service::start(&["--config", file.to_str().unwrap()]);
     assert_eq!(
-        edge.hears("READY=1").len(),
+        edge.receives_from("READY=1").len(),
         1,
         "the first notification comes when the node runs"
     );
-    edge.hears("STATUS=leading");
-    edge.hears("WATCHDOG=1");
+    edge.receives_from("STATUS=leading");
+    edge.receives_from("WATCHDOG=1");
 
     let vehicle = Service::start(&["--role", "cav", "--name", "gauss", "--seed", &gossip]);
-    let before = vehicle.hears("STATUS=following edge");
+    let before = vehicle.receives_from("STATUS=following edge");
     assert!(before.iter().any(|line| line == "READY=1"), "{before:?}");
-    vehicle.hears("WATCHDOG=1");
-    vehicle.hears("WATCHDOG=1");
+    vehicle.receives_from("WATCHDOG=1");
+    vehicle.receives_from("WATCHDOG=1");
 
     edge.signal(Signal::SIGTERM);
-    edge.hears("STOPPING=1");
-    vehicle.hears("STATUS=no");
+    edge.receives_from("STOPPING=1");
+    vehicle.receives_from("STATUS=no");
     let end = Instant::now() + WATCHDOG;
-    while let Some(line) = vehicle.hear(end) {
+    while let Some(line) = vehicle.receive(end) {
         assert_ne!(line, "WATCHDOG=1", "fed without rounds");
     }
 }
@@ -145,13 +145,13 @@ fn watchdog_needs_rounds() {
 #[test]
 fn stopped_node_feeds_no_watchdog() {
     let edge = Service::start(&["--role", "edge", "--listen", "127.0.0.1:0"]);
-    edge.hears("WATCHDOG=1");
+    edge.receives_from("WATCHDOG=1");
     edge.signal(Signal::SIGSTOP);
     // Messages from before the signal.
-    while edge.hear(Instant::now() + WATCHDOG / 20).is_some() {}
-    assert_eq!(edge.hear(Instant::now() + WATCHDOG / 2), None);
+    while edge.receive(Instant::now() + WATCHDOG / 20).is_some() {}
+    assert_eq!(edge.receive(Instant::now() + WATCHDOG / 2), None);
     edge.signal(Signal::SIGCONT);
-    edge.hears("WATCHDOG=1");
+    edge.receives_from("WATCHDOG=1");
 }
 
 /// Log of a node that is stopped as soon as it serves.

@@ -19,7 +19,7 @@ use rumqttc::v5::MqttOptions;
 use uuid::Uuid;
 
 use crate::connection::{ConnectionState, RECEIVED};
-use crate::streams::{ForeignMessage, MessageStream, Streams};
+use crate::streams::{CpmMessage, MessageStream, Streams};
 use crate::{Error, Tls};
 
 /// Address of a cell, and identity of the program.
@@ -251,7 +251,7 @@ impl Cell {
 
     /// The collective perception messages (CPM) of other stations, from now on: of each receiver
     /// the newest.
-    pub fn received_cpms(&self) -> Messages<ForeignMessage> {
+    pub fn received_cpms(&self) -> Messages<CpmMessage> {
         self.read(&format!("{RECEIVED}/+"), |streams| &streams.foreign, false)
     }
 

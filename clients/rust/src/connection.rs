@@ -175,7 +175,7 @@ impl ConnectionState {
                 Ok(Ok(event)) => event,
                 Ok(Err(error)) => {
                     let reason = with_causes(&error);
-                    self.note_failure(&error, &reason);
+                    self.record_failure(&error, &reason);
                     return reason;
                 }
                 Err(_) => return "closed".to_owned(),
@@ -184,14 +184,14 @@ impl ConnectionState {
             match event {
                 Event::Incoming(Incoming::ConnAck(_)) => state.begin(client),
                 Event::Incoming(Incoming::Publish(message)) => {
-                    self.take(&mut state, &message.topic, &message.payload);
+                    self.on_message(&mut state, &message.topic, &message.payload);
                 }
                 Event::Incoming(Incoming::SubAck(answer)) => {
                     let refused = answer
                         .return_codes
                         .iter()
                         .find(|code| !matches!(code, SubscribeReasonCode::Success(_)));
-                    state.note_answer(answer.pkid, refused.map(|code| format!("{code:?}")));
+                    state.record_answer(answer.pkid, refused.map(|code| format!("{code:?}")));
                 }
                 Event::Incoming(Incoming::PubAck(answer)) => {
                     let text = answer
@@ -204,7 +204,7 @@ impl ConnectionState {
                             .then(|| "only nodes place boxes, connect to a node".to_owned()),
                         reason => Some(text.unwrap_or_else(|| format!("{reason:?}"))),
                     };
-                    state.note_answer(answer.pkid, refusal);
+                    state.record_answer(answer.pkid, refusal);
                 }
                 Event::Outgoing(Outgoing::Publish(packet) | Outgoing::Subscribe(packet))
                     if packet != 0 =>
@@ -228,16 +228,16 @@ impl ConnectionState {
     }
 
     /// Processes a message. An unusable one is counted, and the first of its kind is logged.
-    fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
+    fn on_message(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
         let text = std::str::from_utf8(topic).ok();
         let received = text.and_then(|topic| topic.strip_prefix(&self.topics.filter(RECEIVED)));
         let receiver =
             received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok());
         let taken = match receiver {
-            Some(receiver) => state.streams.take_foreign(receiver, payload),
+            Some(receiver) => state.streams.on_cpm(receiver, payload),
             None => {
                 let parsed = text.and_then(|topic| self.topics.parse(topic));
-                state.streams.take(parsed, payload, Instant::now())
+                state.streams.on_message(parsed, payload, Instant::now())
             }
         };
         let Err(reason) = taken else { return };
@@ -250,7 +250,7 @@ impl ConnectionState {
         }
     }
 
-    fn note_failure(&self, error: &ConnectionError, reason: &str) {
+    fn record_failure(&self, error: &ConnectionError, reason: &str) {
         let mut state = self.state();
         let refusal = match error {
             ConnectionError::ConnectionRefused(code) => {
@@ -297,7 +297,7 @@ impl State {
         self.filters.insert(filter.to_owned());
         let Some(client) = &self.client else { return };
         if !self.asked.contains(filter) && client.try_subscribe(filter, QoS::AtLeastOnce).is_ok() {
-            self.ask(filter);
+            self.request(filter);
         }
     }
 
@@ -316,7 +316,7 @@ impl State {
         };
         let is_sent = client.try_publish(topic, qos, false, payload).is_ok();
         if is_sent && is_question {
-            self.ask(topic);
+            self.request(topic);
         }
         is_sent
     }
@@ -337,7 +337,7 @@ impl State {
         )))
     }
 
-    fn ask(&mut self, topic: &str) {
+    fn request(&mut self, topic: &str) {
         self.asked.insert(topic.to_owned());
         self.queued.push_back(topic.to_owned());
     }
@@ -349,7 +349,7 @@ impl State {
             .is_some_and(|topic| topic.contains("/boxes/"))
     }
 
-    fn note_answer(&mut self, packet: u16, refusal: Option<String>) {
+    fn record_answer(&mut self, packet: u16, refusal: Option<String>) {
         if let (Some(topic), Some(reason)) = (self.unanswered.remove(&packet), refusal) {
             log::warn!("the broker refuses {topic}: {reason}");
             self.denied.insert(topic, reason);

@@ -19,5 +19,5 @@ pub use ecod::wire::{
     Trouble, Verdict, Verdicts, WirePose,
 };
 pub use error::Error;
-pub use streams::ForeignMessage;
+pub use streams::CpmMessage;
 pub use tls::Tls;

@@ -23,12 +23,12 @@ pub(crate) struct Streams {
     pub(crate) statuses: MessageStream<NodeStatus>,
     pub(crate) descriptions: MessageStream<CellDescription>,
     pub(crate) reports: MessageStream<ObjectReport>,
-    pub(crate) foreign: MessageStream<ForeignMessage>,
+    pub(crate) foreign: MessageStream<CpmMessage>,
 }
 
 /// A message of another station that is not a node, in its own format.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ForeignMessage {
+pub struct CpmMessage {
     /// Name of the receiver that brought it: the last level of its topic.
     pub receiver: NodeName,
     /// The message as it is.
@@ -53,20 +53,20 @@ const UNNAMED: NodeName = NodeName::from_static("-");
 
 impl Streams {
     /// Processes a payload. A rejected payload has no effect.
-    pub(crate) fn take(
+    pub(crate) fn on_message(
         &mut self,
         topic: Option<Topic>,
         payload: &[u8],
         now: Instant,
     ) -> Result<(), RejectReason> {
         match topic {
-            Some(Topic::GlobalDetections) => self.maps.take(payload, now, |map| {
+            Some(Topic::GlobalDetections) => self.maps.on_message(payload, now, |map| {
                 (map.epoch, Some(&map.aggregator), map.round)
             }),
-            Some(Topic::GlobalVerdicts) => self.verdicts.take(payload, now, |it| {
+            Some(Topic::GlobalVerdicts) => self.verdicts.on_message(payload, now, |it| {
                 (it.epoch, Some(&it.aggregator), it.round)
             }),
-            Some(Topic::Reputations) => self.reputations.take(payload, now, |it| {
+            Some(Topic::Reputations) => self.reputations.on_message(payload, now, |it| {
                 (it.epoch, it.aggregator.as_ref(), it.round)
             }),
             Some(Topic::Cell) if payload.is_empty() => {
@@ -100,7 +100,7 @@ impl Streams {
     }
 
     /// Processes a message of a station that is not a node.
-    pub(crate) fn take_foreign(
+    pub(crate) fn on_cpm(
         &mut self,
         receiver: NodeName,
         payload: &[u8],
@@ -110,7 +110,7 @@ impl Streams {
         }
         self.foreign.put(
             Some(receiver.clone()),
-            ForeignMessage {
+            CpmMessage {
                 receiver,
                 payload: payload.to_vec(),
             },
@@ -132,7 +132,7 @@ impl<M> Default for MessageStream<M> {
 
 impl<M> MessageStream<M> {
     /// Stores a round, unless it is earlier than the last one by epoch, aggregator and number.
-    fn take(
+    fn on_message(
         &mut self,
         payload: &[u8],
         now: Instant,

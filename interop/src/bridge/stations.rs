@@ -76,7 +76,7 @@ impl StationPlaces {
 
     /// Returns false if there is no room for a report of the station now. If a report comes
     /// slightly early, the station's next report is due later.
-    pub(super) fn take_room(&mut self, number: u32, now: Instant) -> bool {
+    pub(super) fn reserve_room(&mut self, number: u32, now: Instant) -> bool {
         let counts = self.counts();
         let receivers = counts.len();
         let of_receiver = self
@@ -169,7 +169,7 @@ mod tests {
             }
             let times =
                 (0..100).map(|n| start + Duration::from_millis(n * period_ms + 30 * (n % 2)));
-            times.filter(|time| places.take_room(7, *time)).count()
+            times.filter(|time| places.reserve_room(7, *time)).count()
         };
         assert_eq!(taken(100, 1, &HONEST), 100);
         assert!(

@@ -355,7 +355,7 @@ async fn report(
             .iter()
             .filter(|map| map.at >= captured_at)
             .find(rests_on);
-        latencies.take_time(answer.map(|map| map.at.since(captured_at)), LAST_MAP);
+        latencies.record_time(answer.map(|map| map.at.since(captured_at)), LAST_MAP);
     }
     Ok(latencies)
 }
@@ -398,7 +398,7 @@ fn delays(micros: &[i64]) -> anyhow::Result<Latencies> {
     );
     let mut latencies = Latencies::default();
     for delay in micros {
-        latencies.take_time(
+        latencies.record_time(
             Some(Duration::from_micros(
                 (*delay).try_into().unwrap_or_default(),
             )),

@@ -65,13 +65,18 @@ impl Latencies {
     }
 
     /// Adds one answer that was due, or the time for which it was waited for.
-    pub(super) fn take(&mut self, due: Instant, arrival: Option<Instant>, waited_until: Instant) {
+    pub(super) fn record_arrival(
+        &mut self,
+        due: Instant,
+        arrival: Option<Instant>,
+        waited_until: Instant,
+    ) {
         let taken = |end: Instant| end.saturating_duration_since(due);
-        self.take_time(arrival.map(taken), taken(waited_until));
+        self.record_time(arrival.map(taken), taken(waited_until));
     }
 
     /// Adds the time of one answer, or the time for which it was waited for.
-    pub(super) fn take_time(&mut self, taken: Option<Duration>, waited: Duration) {
+    pub(super) fn record_time(&mut self, taken: Option<Duration>, waited: Duration) {
         self.missing += u64::from(taken.is_none());
         let nanos = taken.unwrap_or(waited).as_nanos();
         self.histogram

@@ -169,9 +169,9 @@ async fn gather(vehicles: &[BenchVehicle], schedule: Schedule, load: Load) -> (A
             for (tick, (map, verdict)) in (0..).zip(map.iter().zip(verdict)).skip(warm_up as usize)
             {
                 let due = schedule.begin(tick) + load.spread + later;
-                answers.map.take(due, *map, waited_until);
+                answers.map.record_arrival(due, *map, waited_until);
                 if load.votes {
-                    answers.verdict.take(due, *verdict, waited_until);
+                    answers.verdict.record_arrival(due, *verdict, waited_until);
                 }
             }
         };

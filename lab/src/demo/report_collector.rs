@@ -59,7 +59,7 @@ impl ReportCollector {
             security: Security::default(),
             clock: Default::default(),
             counters: Arc::default(),
-            subscriber: Arc::new(move |delivery| lock(&kept).take(delivery)),
+            subscriber: Arc::new(move |delivery| lock(&kept).add(delivery)),
             seed: 1,
             looks_on: false,
         };
@@ -104,7 +104,7 @@ impl ReportCollector {
 
 impl Seen {
     /// A vehicle sends each report to leader and standby; one is kept.
-    fn take(
+    fn add(
         &mut self,
         Delivery {
             message,

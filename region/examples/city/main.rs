@@ -101,7 +101,7 @@ fn main() -> anyhow::Result<()> {
     city.cluster.signal(2, Signal::SIGKILL)?;
     city.until_whole("on the two that are left", at)?;
     city.steady(arguments.seconds / 2);
-    city.note_too_old("a server was killed");
+    city.record_too_old("a server was killed");
     city.cluster.restart(2)?;
 
     if !arguments.quick {
@@ -118,14 +118,14 @@ fn main() -> anyhow::Result<()> {
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGCONT)?;
         city.until_whole("after it goes on", at)?;
-        city.note_too_old("a server was stopped and went on");
+        city.record_too_old("a server was stopped and went on");
 
         if city.real.len() >= 5 {
             println!("\nfive real cells cut off for {PAUSE:?}");
             city.cut_off();
             let at = clock::now();
             city.until_whole("after their return", at)?;
-            city.note_too_old("cells were cut off");
+            city.record_too_old("cells were cut off");
         }
     }
 
@@ -136,7 +136,7 @@ fn main() -> anyhow::Result<()> {
     city.until_whole("from the start of the servers", at)?;
     city.steady(arguments.seconds / 2);
     city.overview()?;
-    city.note_too_old("all servers were killed");
+    city.record_too_old("all servers were killed");
 
     let too_old = city.too_old;
     println!(
@@ -211,7 +211,7 @@ impl City {
     }
 
     /// Notes maps that counted since the last call though they were too old.
-    fn note_too_old(&mut self, after: &str) {
+    fn record_too_old(&mut self, after: &str) {
         let too_old = self
             .take_too_old()
             .into_iter()

@@ -66,7 +66,7 @@ impl Watch {
                         let taken = map.map(|map| (map.round, map.fused_at));
                         drop(town);
                         if let Some((round, sent_at)) = taken {
-                            figures.take(&topic.cell, round, sent_at, reading.at);
+                            figures.record_map(&topic.cell, round, sent_at, reading.at);
                         }
                     }
                     Ok(Accepted::Other(_)) => {}
@@ -163,7 +163,7 @@ impl Default for Figures {
 }
 
 impl Figures {
-    fn take(&mut self, cell: &NodeName, round: u64, sent_at: Timestamp, at: Timestamp) {
+    fn record_map(&mut self, cell: &NodeName, round: u64, sent_at: Timestamp, at: Timestamp) {
         let age = at.since(sent_at);
         self.maps += 1;
         self.ages

@@ -111,7 +111,7 @@ impl VehicleClock {
     }
 
     /// Records the position of a sender that states that it does not move.
-    pub(super) fn note_standing(&mut self, report: &ObjectReport, at: Timestamp) {
+    pub(super) fn record_standing(&mut self, report: &ObjectReport, at: Timestamp) {
         let pose = report.pose.filter(|_| report.moving == Some(false));
         let place = pose.map(|pose| Point2::new(pose.x_m, pose.y_m));
         match place.zip(self.stood_at) {

@@ -62,7 +62,7 @@ impl Election {
     }
 
     /// Processes a leader's beat or claim.
-    pub(super) fn take_beat(&mut self, beat: Beat, now: Timestamp) {
+    pub(super) fn on_beat(&mut self, beat: Beat, now: Timestamp) {
         if self.is_over(&beat.epoch) {
             self.send_status(&beat.epoch.leader, now);
             return;
@@ -164,7 +164,7 @@ impl Election {
 
     fn follow(&mut self, beat: Beat, now: Timestamp) {
         self.epoch = Some(beat.epoch.clone());
-        self.learn_round(&beat.epoch.leader, beat.round);
+        self.observe_round(&beat.epoch.leader, beat.round);
         self.leader_clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now));
         self.waiting_questions.clear();
         let leader = beat.epoch.leader.clone();
@@ -197,7 +197,7 @@ impl Election {
     }
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
-        self.learn_round(&beat.epoch.leader, beat.round);
+        self.observe_round(&beat.epoch.leader, beat.round);
         match &mut self.leader_clock {
             Some(clock) if clock.is_of(&beat.epoch) => clock.beat(beat.life, now),
             clock => *clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now)),
@@ -209,7 +209,7 @@ impl Election {
             return;
         };
         following.beat_interval = Duration::from_millis(beat.every_ms);
-        following.hear(now);
+        following.receive(now);
         following.has_beaten = true;
         following.forget_round_interval(now);
         if beat.hears_us {
@@ -220,7 +220,7 @@ impl Election {
     }
 
     /// Derives changes of leadership from the sender's epoch, which every message contains.
-    pub(super) fn hear_others(&mut self, message: &ElectionMessage, now: Timestamp) {
+    pub(super) fn on_foreign_message(&mut self, message: &ElectionMessage, now: Timestamp) {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
@@ -272,7 +272,7 @@ impl Election {
                     }
                     Some(other) if *other != own => {}
                     _ if message.term > own.term => self.renew_later(&message.from, now),
-                    Some(_) => self.peers.note_refusal(&message.from, false),
+                    Some(_) => self.peers.record_refusal(&message.from, false),
                     None => {}
                 }
             }
@@ -282,14 +282,14 @@ impl Election {
 
     /// Processes another node's status: whether it refuses this node's leadership, which epoch it
     /// reports as over, and at which brokers it cannot log in.
-    pub(super) fn take_status(
+    pub(super) fn on_status(
         &mut self,
         from: &NodeName,
         over: Option<&Epoch>,
         no_login: Vec<NodeName>,
         now: Timestamp,
     ) {
-        self.peers.note_no_login(from, no_login);
+        self.peers.record_no_login(from, no_login);
         if let State::Leading(leading) = &self.state
             && over.is_some_and(|over| *over >= leading.epoch)
         {
@@ -311,9 +311,9 @@ impl Election {
 
     /// Closes the epoch that a leader has resigned from. A follower of that leader starts seeking
     /// at once instead of waiting for the leader's timeout.
-    pub(super) fn take_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
+    pub(super) fn on_resign(&mut self, epoch: &Epoch, last_round: u64, now: Timestamp) {
         if self.epoch.as_ref() == Some(epoch) {
-            self.learn_round(&epoch.leader, last_round);
+            self.observe_round(&epoch.leader, last_round);
         }
         if let State::Following(following) = &mut self.state {
             following.claim.take_if(|claim| claim.1.epoch == *epoch);

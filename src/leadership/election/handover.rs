@@ -61,7 +61,7 @@ impl Election {
             return;
         };
         let to = handover.to.clone();
-        let fit = self.peers.hears(&to, now)
+        let fit = self.peers.receives_from(&to, now)
             && self.peers.may_lead(&to, now)
             && !self.is_out_of_reach(&to, now);
         let State::Leading(leading) = &mut self.state else {
@@ -94,7 +94,7 @@ impl Election {
 
     /// Processes a challenger's answer that it is ready to lead. From now on rounds are held, and
     /// the leader yields to the challenger right after the second of them.
-    pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
+    pub(super) fn on_ready(&mut self, from: &NodeName, now: Timestamp) {
         if let State::Leading(leading) = &mut self.state
             && let Some(handover) = leading
                 .handover
@@ -109,15 +109,15 @@ impl Election {
     /// Records a round that this node published or accepted. A follower takes it as a sign of life
     /// of the leader. A leader with a ready challenger holds the next round; if this one was held
     /// already, it yields now, because almost a whole period remains.
-    pub(super) fn note_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
+    pub(super) fn record_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         if epoch.term <= self.term_limit(Role::Auto, now) {
-            self.learn_term(epoch.term);
+            self.observe_term(epoch.term);
         }
-        self.learn_round(&epoch.leader, round);
+        self.observe_round(&epoch.leader, round);
         let least = self.config.beat();
         match &mut self.state {
             State::Following(following) if following.epoch == *epoch => {
-                following.take_round(least, now);
+                following.on_round(least, now);
             }
             State::Leading(leading) => {
                 if let Some(handover) = leading
@@ -143,7 +143,7 @@ impl Election {
     /// ([`ElectionEffect::Prepare`]); when the preparation is complete, every further offer is
     /// answered with `Ready`, because an earlier answer may have been lost. Offers of a node that
     /// is not the followed leader are ignored.
-    pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
+    pub(super) fn on_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
         let may_lead = self.candidacy().may_lead();
         let State::Following(following) = &mut self.state else {
             return;
@@ -177,7 +177,7 @@ impl Election {
 
     /// Takes over leadership after the old leader has yielded: the first own round is
     /// `last_round + 1`.
-    pub(super) fn take_yield(
+    pub(super) fn on_yield(
         &mut self,
         from: &NodeName,
         epoch: Option<&Epoch>,
@@ -192,7 +192,7 @@ impl Election {
             && following.prepared;
         if ours && self.candidacy().may_lead() {
             let after = following.epoch.clone();
-            self.learn_round(from, last_round);
+            self.observe_round(from, last_round);
             self.lead(Some(after), now);
         }
     }

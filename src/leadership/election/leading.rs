@@ -148,7 +148,7 @@ impl Election {
     /// term or regards this epoch as over. A newer leader that is just taking over has time to
     /// announce itself first.
     pub(super) fn renew_later(&mut self, refused_by: &NodeName, now: Timestamp) {
-        self.peers.note_refusal(refused_by, true);
+        self.peers.record_refusal(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
             leading
@@ -209,7 +209,7 @@ impl Election {
                 .get(to)
                 .and_then(|peer| peer.candidacy)
                 .is_some_and(outranks)
-                && self.peers.hears(to, self.clock.now()) =>
+                && self.peers.receives_from(to, self.clock.now()) =>
             {
                 self.config.near_beat()
             }

@@ -103,7 +103,7 @@ impl Following {
     }
 
     /// Records a message or round of the leader.
-    pub(super) fn hear(&mut self, now: Timestamp) {
+    pub(super) fn receive(&mut self, now: Timestamp) {
         self.direct_at = now;
         self.given_up = false;
         self.claim = None;
@@ -112,7 +112,7 @@ impl Following {
 
     /// Records an accepted round. The interval adapts to slower rounds at once and to faster rounds
     /// gradually.
-    pub(super) fn take_round(&mut self, least: Duration, now: Timestamp) {
+    pub(super) fn on_round(&mut self, least: Duration, now: Timestamp) {
         if let Some(last) = self.round_at.replace(now) {
             let gap = now.since(last);
             if gap < overdue(least) && self.early_gaps < EARLY_ROUNDS {
@@ -122,7 +122,7 @@ impl Following {
                 self.round_interval = Some(gap.max(known * 7 / 8).max(least));
             }
         }
-        self.hear(now);
+        self.receive(now);
     }
 
     /// Removes the round interval when rounds have stopped arriving.
@@ -230,7 +230,7 @@ mod tests {
                     Timestamp::default(),
                 );
                 if has_rounds {
-                    (1..=20).for_each(|round| leader.take_round(config.beat(), ms(100 * round)));
+                    (1..=20).for_each(|round| leader.on_round(config.beat(), ms(100 * round)));
                 }
                 leader.bidirectional_at = leader.direct_at;
                 leader.given_up = given_up;
@@ -260,12 +260,12 @@ mod tests {
             Timestamp::default(),
         );
         // A beat is due with the round: 50 ms after the previous beat, and slightly late.
-        leader.take_round(config.beat(), ms(53));
+        leader.on_round(config.beat(), ms(53));
         leader.indirect_heard_at = ms(52);
         assert_eq!(leader.lost_at(&config), ms(53) + config.standby_silence());
         // Other nodes receive the leader after it stopped confirming this node: the path to the
         // leader is broken.
-        leader.take_round(config.beat(), ms(90));
+        leader.on_round(config.beat(), ms(90));
         leader.indirect_heard_at = ms(110);
         assert_eq!(leader.lost_at(&config), ms(110) + config.response_timeout());
     }

@@ -89,7 +89,7 @@ impl Peers {
     }
 
     /// Records a term above 0 that a possible leader states.
-    pub(super) fn note_term(&mut self, name: &NodeName, term: u64) {
+    pub(super) fn record_term(&mut self, name: &NodeName, term: u64) {
         let lowest = &mut self.table.entry(name.clone()).or_default().term;
         *lowest = if *lowest == 0 {
             term
@@ -149,7 +149,7 @@ impl Peers {
     }
 
     /// Records whether a peer refuses this node's leadership.
-    pub(super) fn note_refusal(&mut self, name: &NodeName, refuses: bool) {
+    pub(super) fn record_refusal(&mut self, name: &NodeName, refuses: bool) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.refuses = refuses;
         }
@@ -159,11 +159,11 @@ impl Peers {
     pub(super) fn any_refuses(&self, now: Timestamp) -> bool {
         self.table
             .iter()
-            .any(|(name, peer)| peer.refuses && self.hears(name, now))
+            .any(|(name, peer)| peer.refuses && self.receives_from(name, now))
     }
 
     /// Records at whose brokers a peer cannot log in.
-    pub(super) fn note_no_login(&mut self, name: &NodeName, at: Vec<NodeName>) {
+    pub(super) fn record_no_login(&mut self, name: &NodeName, at: Vec<NodeName>) {
         if at.is_empty() && !self.lacks_logins {
             return;
         }
@@ -222,7 +222,7 @@ impl Peers {
 
     /// Records the sender's state from the fields that every message has. Returns false for a
     /// repeated or overtaken message.
-    pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
+    pub(super) fn record(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
         let contact_timeout = self.contact_timeout;
         let peer = self.table.entry(message.from.clone()).or_default();
         let silent = peer
@@ -297,7 +297,7 @@ impl Peers {
     /// True if a peer has been reachable and fit for `stable`.
     pub(super) fn is_stable(&self, name: &NodeName, stable: Duration, now: Timestamp) -> bool {
         let since = self.table.get(name).and_then(|peer| peer.fit_since);
-        self.hears(name, now) && since.is_some_and(|since| now >= since + stable)
+        self.receives_from(name, now) && since.is_some_and(|since| now >= since + stable)
     }
 
     /// Restarts the time for which a peer must be stable before leadership is handed to it.
@@ -308,7 +308,7 @@ impl Peers {
     }
 
     /// True if a message of the peer was received recently.
-    pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
+    pub(super) fn receives_from(&self, name: &NodeName, now: Timestamp) -> bool {
         self.table
             .get(name)
             .and_then(|peer| peer.heard_at)
@@ -316,7 +316,7 @@ impl Peers {
     }
 
     /// True if a message of the peer was received at `since` or later.
-    pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
+    pub(super) fn received_since(&self, name: &NodeName, since: Timestamp) -> bool {
         self.table
             .get(name)
             .and_then(|peer| peer.heard_at)
@@ -340,9 +340,9 @@ impl Peers {
                 .is_some_and(|epoch| epoch.leader == *leader)
         };
         let is_node = move |name: &NodeName| name != leader && name.vehicle() == *name;
-        self.table
-            .iter()
-            .filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
+        self.table.iter().filter(move |(name, peer)| {
+            follows(peer) && is_node(name) && self.receives_from(name, now)
+        })
     }
 
     /// True if a peer could lead, judged by its last messages even if they are old.
@@ -359,7 +359,7 @@ impl Peers {
         let unfit = |peer: &Peer| {
             peer.candidacy
                 .is_some_and(|candidacy| !candidacy.may_lead())
-                && self.hears(name, now)
+                && self.receives_from(name, now)
         };
         self.table
             .get(name)
@@ -392,11 +392,11 @@ impl Peers {
             self.table
                 .get(name)
                 .is_some_and(|peer| peer.given_up_at.is_some())
-                && !self.heard_since(name, now - silence)
+                && !self.received_since(name, now - silence)
         };
         let mut fit: Vec<_> = self
             .candidates(now)
-            .filter(|(name, _)| self.hears(name, now) && !given_up(name))
+            .filter(|(name, _)| self.receives_from(name, now) && !given_up(name))
             .collect();
         fit.sort_by_key(|&(name, candidacy)| (candidacy.rank(), candidacy.load, name.clone()));
         if self.lacks_logins {
@@ -423,7 +423,7 @@ impl Peers {
     ) -> Option<(NodeName, Timestamp)> {
         self.candidates(now)
             .filter(|(name, other)| {
-                self.hears(name, now) && other.rank() < ours && !out_of_reach(name)
+                self.receives_from(name, now) && other.rank() < ours && !out_of_reach(name)
             })
             .filter_map(|(name, other)| {
                 Some((name, other, self.table.get(name)?.fit_since? + stable))

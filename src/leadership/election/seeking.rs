@@ -188,7 +188,7 @@ impl Election {
     /// Processes another node's evidence about the leader. The evidence is dated by the question
     /// that it answers and by the leader's own sign of life; it can keep or bring back a leader, or
     /// make this node follow a leader of a higher epoch.
-    pub(super) fn take_leader_evidence(
+    pub(super) fn on_leader_evidence(
         &mut self,
         from: &NodeName,
         epoch: Option<Epoch>,
@@ -306,7 +306,7 @@ impl Election {
     /// nodes. A follower's own record of other nodes may be as old as their first greeting.
     fn place(&self, order: &[NodeName], since: Option<Timestamp>) -> u32 {
         let now = self.clock.now();
-        let present = |name: &NodeName| since.is_none_or(|at| self.peers.heard_since(name, at));
+        let present = |name: &NodeName| since.is_none_or(|at| self.peers.received_since(name, at));
         let there = |name: &&NodeName| {
             **name == self.id || self.peers.may_succeed(name, now) && present(name)
         };

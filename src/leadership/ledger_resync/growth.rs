@@ -57,14 +57,14 @@ impl GrowthLimit {
         let mut limit = Self::default();
         ledger
             .entries()
-            .for_each(|entry| limit.note_entry(&entry, now));
+            .for_each(|entry| limit.record_entry(&entry, now));
         ledger
             .marks()
-            .for_each(|mark| limit.note_mark(&mark, ledger, now));
+            .for_each(|mark| limit.record_mark(&mark, ledger, now));
         limit
     }
 
-    /// True if a count is plausible. [`Self::note`] records the first count of a vehicle and label.
+    /// True if a count is plausible. [`Self::record`] records the first count of a vehicle and label.
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
         self.admits_votes(
             &key_of(entry),
@@ -81,20 +81,25 @@ impl GrowthLimit {
     }
 
     /// Records the counts of a share that the ledger has now.
-    pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
+    pub(super) fn record(
+        &mut self,
+        share: &LedgerShare,
+        ledger: &ReputationLedger,
+        now: Timestamp,
+    ) {
         for entry in share
             .entries
             .iter()
             .filter(|entry| !ledger.lacks_entry(entry))
         {
-            self.note_entry(entry, now);
+            self.record_entry(entry, now);
         }
         for mark in share.marks.iter().filter(|mark| !ledger.lacks_mark(mark)) {
-            self.note_mark(mark, ledger, now);
+            self.record_mark(mark, ledger, now);
         }
     }
 
-    fn note_entry(&mut self, entry: &LedgerEntry, now: Timestamp) {
+    fn record_entry(&mut self, entry: &LedgerEntry, now: Timestamp) {
         self.first
             .entry(key_of(entry))
             .or_insert((now, entry.correct.saturating_add(entry.incorrect)));
@@ -102,7 +107,7 @@ impl GrowthLimit {
 
     /// Records a mark with the counts of the ledger, because a recently received lane may have old
     /// marks.
-    fn note_mark(&mut self, mark: &LedgerMark, ledger: &ReputationLedger, now: Timestamp) {
+    fn record_mark(&mut self, mark: &LedgerMark, ledger: &ReputationLedger, now: Timestamp) {
         let votes = mark
             .correct
             .saturating_add(mark.incorrect)

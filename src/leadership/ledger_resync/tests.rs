@@ -95,7 +95,7 @@ impl Candidate {
     }
 
     /// Merges shares; returns the answers.
-    fn hear(&mut self, shares: &[LedgerShare]) -> Vec<LedgerShare> {
+    fn receive(&mut self, shares: &[LedgerShare]) -> Vec<LedgerShare> {
         let now_ms = self.now_ms;
         shares
             .iter()
@@ -348,7 +348,7 @@ fn dead_leaders_evidence_survives_split() {
     a.lead(1);
     b1.lead(2);
     b1.record(2, "euclid");
-    b2.hear(&b1.wait(1));
+    b2.receive(&b1.wait(1));
     drop(b1);
     b2.lead(3);
     // The loser's messages when the sides heal are lost: it is not yet linked to the winner's
@@ -357,8 +357,8 @@ fn dead_leaders_evidence_survives_split() {
     drop(b2.resync.snapshot(&b2.ledger));
     a.lead(4);
     assert_eq!(a.vehicles(), [""; 0]);
-    let answer = b2.hear(&a.wait(1));
-    a.hear(&answer);
+    let answer = b2.receive(&a.wait(1));
+    a.receive(&answer);
     assert_eq!(a.vehicles(), ["euclid"]);
 }
 
@@ -369,14 +369,14 @@ fn followers_evidence_reaches_next_leader() {
     let mut b2 = Candidate::new("b2");
     b1.lead(2);
     b1.record(2, "euclid");
-    b2.hear(&b1.wait(1));
+    b2.receive(&b1.wait(1));
     drop(b1);
     a.lead(3);
     a.record(3, "gauss");
-    assert_eq!(b2.hear(&a.wait(1)), []);
-    a.hear(&b2.wait(2));
+    assert_eq!(b2.receive(&a.wait(1)), []);
+    a.receive(&b2.wait(2));
     assert_eq!(a.vehicles(), ["euclid", "gauss"]);
-    b2.hear(&a.wait(1));
+    b2.receive(&a.wait(1));
     assert_eq!(b2.wait(2), [], "once the leader has it, nothing more comes");
 }
 
@@ -386,7 +386,7 @@ fn candidate_without_counts_stays_silent() {
     let mut other = Candidate::new("other");
     leader.lead(1);
     leader.record(1, "euclid");
-    assert_eq!(other.hear(&leader.wait(1)), []);
+    assert_eq!(other.receive(&leader.wait(1)), []);
     assert_eq!(other.vehicles(), ["euclid"]);
     assert_eq!(other.wait(2), []);
 }
@@ -411,7 +411,7 @@ fn many_counts_stay_acceptable() {
     let mut euclid = signing("euclid", 7, "edge");
     edge.lead(7);
     (0..100_000).for_each(|_| drop(edge.record(7, "gauss")));
-    euclid.hear(&sign(edge.resync.snapshot(&edge.ledger)));
+    euclid.receive(&sign(edge.resync.snapshot(&edge.ledger)));
     let later = (0..32).flat_map(|_| sign(edge.record(7, "gauss")));
     let refused: Vec<_> = later
         .flat_map(|share| euclid.merge(&share, 3000).unwrap().refused)
@@ -480,7 +480,7 @@ fn unsigned_evidence_is_refused() {
         (false, Vec::new()),
         "there is nothing to sign"
     );
-    euclid.hear(&sign(vec![honest]));
+    euclid.receive(&sign(vec![honest]));
     assert_eq!(euclid.incorrect("gauss"), 1);
 }
 
@@ -530,7 +530,7 @@ fn invented_lane_has_no_effect() {
         );
     }
     euclid.leadership = following(8, "gauss");
-    euclid.hear(&sign(vec![share(
+    euclid.receive(&sign(vec![share(
         "gauss",
         Some(8),
         vec![slander(8, "gauss", 3)],
@@ -567,19 +567,19 @@ fn dead_leaders_signature_is_relayed() {
         said.extend(sign(edge.record(7, vehicle)));
     }
     assert_eq!(said.len(), 3, "one signature for each round");
-    euclid.hear(&said);
+    euclid.receive(&said);
     euclid.wait_until(EVIDENCE_TRIAL.as_millis() as u64);
     let news = share("leader", Some(8), Vec::new());
     euclid.leadership = following(8, "leader");
     edge.leadership = following(8, "leader");
-    euclid.hear(std::slice::from_ref(&news));
+    euclid.receive(std::slice::from_ref(&news));
     let passed_on = euclid.wait(4);
     assert!(
         passed_on
             .iter()
             .all(|share| share.signed == said[0].signed && share.node == name("other"))
     );
-    gauss.hear(&passed_on);
+    gauss.receive(&passed_on);
     assert_eq!(gauss.ledger.totals(), edge.ledger.totals());
     let statements = gauss.ledger.statements().count();
     assert!(
@@ -604,7 +604,7 @@ fn lost_counts_are_recovered() {
     before.record(7, "gauss");
     edge.ledger = before.ledger.clone();
     let lost = sign(before.record(7, "gauss"));
-    edge.hear(&[LedgerShare {
+    edge.receive(&[LedgerShare {
         node: name("other"),
         ..lost[0].clone()
     }]);
@@ -670,9 +670,9 @@ fn reset_empties_all_ledgers() {
     );
     assert!(leader.merge(&answers[0], 6010).unwrap().is_news);
     assert_eq!(leader.vehicles(), [""; 0]);
-    leader.hear(&poisoned);
+    leader.receive(&poisoned);
     assert_eq!(leader.vehicles(), [""; 0]);
-    euclid.hear(&leader.record(7, "gauss"));
+    euclid.receive(&leader.record(7, "gauss"));
     assert_eq!(euclid.vehicles(), ["gauss"]);
     let far = Timestamp(0) + 2 * MAX_RESET_AHEAD;
     let forged = LedgerShare {
@@ -737,7 +737,7 @@ fn renewed_term_keeps_one_lane() {
             epoch: Some(Epoch::new(term, name("edge"))),
             ..gauss.leadership
         };
-        gauss.hear(&edge.record(term, "euclid"));
+        gauss.receive(&edge.record(term, "euclid"));
     }
     let merged = gauss
         .merge(&share("other", None, vec![slander(2, "edge", 1)]), 100_000)

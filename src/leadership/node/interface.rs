@@ -174,7 +174,7 @@ pub enum Effect {
     /// Publish the leadership to all other parts. It precedes the [`Effect::Lead`] that it
     /// announces, because the node's broker admits the first round only after it has received the
     /// new leader.
-    TellLeadership {
+    PublishLeadership {
         /// The leadership.
         leadership: Leadership,
     },

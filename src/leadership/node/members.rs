@@ -26,7 +26,7 @@ impl Members {
 
     /// Removes a member. The address of its broker is kept for a while, because that broker's end
     /// may be noticed a moment later.
-    pub(super) fn part_with(&mut self, name: &NodeName, now: Timestamp) {
+    pub(super) fn member_down(&mut self, name: &NodeName, now: Timestamp) {
         self.departed.retain(|_, (_, until)| now < *until);
         if let Some(broker) = self.living.remove(name).and_then(|member| member.broker) {
             self.departed
@@ -124,7 +124,7 @@ mod tests {
         let broker = "10.0.0.1:1".parse().unwrap();
         members.place(edge.clone());
         assert_eq!(members.at(&broker, at(0)), std::slice::from_ref(&edge.name));
-        members.part_with(&edge.name, at(0));
+        members.member_down(&edge.name, at(0));
         assert_eq!(
             members.at(&broker, at(4999)),
             std::slice::from_ref(&edge.name)

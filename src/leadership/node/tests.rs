@@ -60,10 +60,10 @@ impl Scene {
             seq: 0,
         };
         if role != Role::Cav {
-            scene.take(Input::OwnBroker {
+            scene.handle_input(Input::OwnBroker {
                 address: Some(broker(1)),
             });
-            scene.take(Input::LinkChanged {
+            scene.handle_input(Input::LinkChanged {
                 broker: broker(1).into(),
                 state: LinkState::Up,
             });
@@ -74,13 +74,13 @@ impl Scene {
     /// A fit candidate that follows `edge` in term 7, whose standby it is.
     fn standing_by() -> Self {
         let mut scene = Self::new(Role::Auto, None);
-        scene.take(Input::MemberAlive {
+        scene.handle_input(Input::MemberAlive {
             member: member("edge", 2),
         });
         scene.members.push(member("edge", 2));
         scene.run_for(1000);
         scene.beat();
-        scene.take(Input::LinkChanged {
+        scene.handle_input(Input::LinkChanged {
             broker: broker(2).into(),
             state: LinkState::Up,
         });
@@ -91,7 +91,7 @@ impl Scene {
     }
 
     /// Passes an input; checks of the parts, which all work, are answered at once.
-    fn take(&mut self, input: Input) {
+    fn handle_input(&mut self, input: Input) {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
                 Effect::Look => Input::Looked {
@@ -114,7 +114,7 @@ impl Scene {
                     continue;
                 }
             };
-            self.take(answer);
+            self.handle_input(answer);
         }
     }
 
@@ -123,7 +123,7 @@ impl Scene {
         while self.machine.next_deadline() <= end {
             self.now = self.now.max(self.machine.next_deadline());
             self.rounds_due = self.now.since(START).as_millis() as u64 / 100;
-            self.take(Input::Wake);
+            self.handle_input(Input::Wake);
         }
         self.now = end;
     }
@@ -152,13 +152,13 @@ impl Scene {
     }
 
     /// Receives a message from `edge`, which leads in term 7.
-    fn hear(&mut self, body: Body) {
-        self.hear_in(Epoch::new(7, name("edge")), body);
+    fn receive(&mut self, body: Body) {
+        self.receive_in(Epoch::new(7, name("edge")), body);
     }
 
-    fn hear_in(&mut self, epoch: Epoch, body: Body) {
+    fn receive_in(&mut self, epoch: Epoch, body: Body) {
         let message = self.message(epoch, body);
-        self.take(Input::Receive {
+        self.handle_input(Input::Receive {
             from: name("edge"),
             rights: Rights::ALL,
             message,
@@ -167,7 +167,7 @@ impl Scene {
 
     fn beat(&mut self) {
         let successors = vec![name("euclid")];
-        self.hear(Body::Beat {
+        self.receive(Body::Beat {
             every_ms: 50,
             round: 40,
             followers: 1,
@@ -186,19 +186,19 @@ impl Scene {
     }
 
     /// Millisecond `ms` beside a candidate that is ready; rounds end every `round_ms`.
-    fn hear_ready_challenger(&mut self, epoch: &Epoch, ms: u64, round_ms: u64) {
+    fn receive_ready_challenger(&mut self, epoch: &Epoch, ms: u64, round_ms: u64) {
         if ms.is_multiple_of(50) {
-            self.hear_in(
+            self.receive_in(
                 epoch.clone(),
                 Body::Status {
                     over: None,
                     no_login: Vec::new(),
                 },
             );
-            self.hear_in(epoch.clone(), Body::Ready);
+            self.receive_in(epoch.clone(), Body::Ready);
         }
         if ms.is_multiple_of(round_ms) {
-            self.take(Input::RoundAccepted {
+            self.handle_input(Input::RoundAccepted {
                 epoch: epoch.clone(),
                 round: ms / round_ms,
             });
@@ -224,7 +224,7 @@ fn member(node: &str, host: u8) -> SeenMember {
 fn term_is_persisted_before_leading() {
     let mut scene = Scene::new(Role::Auto, None);
     scene.run_for(1300);
-    let leads = |effect: &Effect| matches!(effect, Effect::TellLeadership { leadership } if leadership.is_leading());
+    let leads = |effect: &Effect| matches!(effect, Effect::PublishLeadership { leadership } if leadership.is_leading());
     let persists = scene
         .position_of(|effect| matches!(effect, Effect::PersistTerm { term: 1 }))
         .unwrap();
@@ -238,12 +238,12 @@ fn term_is_persisted_before_leading() {
 #[test]
 fn refused_link_ends_its_leader() {
     let mut scene = Scene::standing_by();
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: broker(2).into(),
         state: LinkState::Down,
     });
     assert_eq!(scene.machine.leadership.position, Position::StandingBy);
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: broker(2).into(),
         state: LinkState::Refused,
     });
@@ -257,11 +257,11 @@ fn refused_link_ends_its_leader() {
 #[test]
 fn last_will_ends_leader() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: "10.0.0.9:1883".parse().unwrap(),
         state: LinkState::Up,
     });
-    scene.take(Input::MemberAlive {
+    scene.handle_input(Input::MemberAlive {
         member: member("edge", 2),
     });
     scene.members.push(member("edge", 2));
@@ -275,10 +275,10 @@ fn last_will_ends_leader() {
         state,
         ..status(Role::Edge)
     };
-    scene.take(Input::StatusHeard {
+    scene.handle_input(Input::StatusHeard {
         status: status(living, NodeState::Aggregating),
     });
-    scene.take(Input::StatusHeard {
+    scene.handle_input(Input::StatusHeard {
         status: status(earlier, NodeState::Offline),
     });
     assert_eq!(
@@ -286,10 +286,10 @@ fn last_will_ends_leader() {
         Some(&name("edge")),
         "the will of a run before this one"
     );
-    scene.take(Input::StatusHeard {
+    scene.handle_input(Input::StatusHeard {
         status: status(living, NodeState::Aggregating),
     });
-    scene.take(Input::StatusHeard {
+    scene.handle_input(Input::StatusHeard {
         status: status(living, NodeState::Offline),
     });
     assert!(
@@ -304,7 +304,7 @@ fn last_will_ends_leader() {
 #[test]
 fn false_will_ends_run_once() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: "10.0.0.9:1883".parse().unwrap(),
         state: LinkState::Up,
     });
@@ -314,7 +314,7 @@ fn false_will_ends_run_once() {
             ..member("edge", 2)
         };
         scene.members = vec![edge.clone()];
-        scene.take(Input::MemberAlive { member: edge });
+        scene.handle_input(Input::MemberAlive { member: edge });
         scene.run_for(1000);
         let successors = vec![name("euclid")];
         let beat = Body::Beat {
@@ -325,7 +325,7 @@ fn false_will_ends_run_once() {
             successors,
             life: LifeSign::default(),
         };
-        scene.hear_in(Epoch::new(7 + 2 * attempt, name("edge")), beat);
+        scene.receive_in(Epoch::new(7 + 2 * attempt, name("edge")), beat);
         assert_eq!(
             scene.machine.leadership.leader(),
             Some(&name("edge")),
@@ -334,7 +334,7 @@ fn false_will_ends_run_once() {
         for state in [NodeState::Aggregating, NodeState::Offline] {
             let node = name("edge");
             let id = Uuid::from_u128(attempt.into());
-            scene.take(Input::StatusHeard {
+            scene.handle_input(Input::StatusHeard {
                 status: NodeStatus {
                     node,
                     id,
@@ -352,19 +352,19 @@ fn false_will_ends_run_once() {
 fn handover_waits_bounded_for_evidence() {
     for (evidence_at, ready_at) in [(Some(0), 300), (Some(420), 450), (None, 1000)] {
         let mut scene = Scene::standing_by();
-        scene.hear(Body::Offer);
+        scene.receive(Body::Offer);
         let offered_at = scene.now;
         let mut ready = None;
         for ms in 0..1200 {
             if evidence_at == Some(ms) {
-                scene.take(Input::EvidenceReceived {
+                scene.handle_input(Input::EvidenceReceived {
                     from: name("gauss"),
                 });
-                scene.take(Input::EvidenceReceived { from: name("edge") });
+                scene.handle_input(Input::EvidenceReceived { from: name("edge") });
             }
             if ms % 50 == 0 {
                 scene.beat();
-                scene.hear(Body::Offer);
+                scene.receive(Body::Offer);
             }
             scene.run_for(1);
             let is_ready = |effect: &Effect| matches!(effect, Effect::Send { message, .. } if message.body == Body::Ready);
@@ -392,17 +392,17 @@ fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, show
     for ms in 0..4500 {
         if let Some(broker) = broker.filter(|_| ms == 1000) {
             if external.is_none() {
-                scene.take(Input::BrokerProven {
+                scene.handle_input(Input::BrokerProven {
                     broker: broker.into(),
                     node: name(shown),
                 });
             }
-            scene.take(Input::LinkChanged {
+            scene.handle_input(Input::LinkChanged {
                 broker: broker.into(),
                 state: LinkState::Up,
             });
         }
-        scene.hear_ready_challenger(&epoch, ms, 100);
+        scene.receive_ready_challenger(&epoch, ms, 100);
     }
     scene
 }
@@ -414,7 +414,7 @@ fn leading_with_external_broker(external: Option<SocketAddr>) -> Scene {
         external: external.map(Into::into),
         embedded: true,
     });
-    scene.take(Input::MemberAlive {
+    scene.handle_input(Input::MemberAlive {
         member: member("edge", 2),
     });
     scene.members.push(member("edge", 2));
@@ -458,16 +458,16 @@ fn lead_is_yielded_after_round() {
     const ROUND_MS: u64 = 700;
     let mut scene = leading_with_external_broker(None);
     let epoch = scene.machine.leadership.epoch.clone().unwrap();
-    scene.take(Input::BrokerProven {
+    scene.handle_input(Input::BrokerProven {
         broker: broker(2).into(),
         node: name("edge"),
     });
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: broker(2).into(),
         state: LinkState::Up,
     });
     let yielded_ms = (0..6000).find(|ms| {
-        scene.hear_ready_challenger(&epoch, *ms, ROUND_MS);
+        scene.receive_ready_challenger(&epoch, *ms, ROUND_MS);
         scene.position_of(is_yield).is_some()
     });
     assert_eq!(
@@ -512,12 +512,12 @@ fn late_wake_up_processes_messages_first() {
     let mut scene = Scene::standing_by();
     let due = scene.machine.next_deadline();
     scene.now = due + Duration::from_millis(300);
-    scene.take(Input::Wake);
+    scene.handle_input(Input::Wake);
     assert_eq!(scene.effects, [], "timers wait");
     assert_eq!(scene.machine.next_deadline(), scene.now + DRAIN_TIME);
     scene.beat();
     scene.now = scene.machine.next_deadline();
-    scene.take(Input::Wake);
+    scene.handle_input(Input::Wake);
     assert_eq!(scene.machine.leadership.position, Position::StandingBy);
     assert!(!scene.machine.is_draining);
 }
@@ -525,7 +525,7 @@ fn late_wake_up_processes_messages_first() {
 #[test]
 fn restarted_gateway_receives_links_and_status() {
     let mut scene = Scene::standing_by();
-    scene.take(Input::GatewayRestarted);
+    scene.handle_input(Input::GatewayRestarted);
     let [links] = &scene
         .effects
         .iter()
@@ -578,10 +578,10 @@ fn vehicle_declares_no_fitness() {
 #[test]
 fn unreachable_node_is_unfit_once() {
     let mut scene = Scene::new(Role::Auto, None);
-    scene.take(Input::OwnBroker {
+    scene.handle_input(Input::OwnBroker {
         address: Some(SocketAddr::from(([127, 0, 0, 1], 1883))),
     });
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: "127.0.0.1:1883".parse().unwrap(),
         state: LinkState::Up,
     });
@@ -619,10 +619,10 @@ fn rebooted_machine_avoids_earlier_term() {
     };
     let mut scene = Scene::new(Role::Auto, None);
     scene.machine = LeadershipNode::new(settings, 4, &before, START);
-    scene.take(Input::OwnBroker {
+    scene.handle_input(Input::OwnBroker {
         address: Some(broker(1)),
     });
-    scene.take(Input::LinkChanged {
+    scene.handle_input(Input::LinkChanged {
         broker: broker(1).into(),
         state: LinkState::Up,
     });
@@ -646,7 +646,7 @@ fn foreign_sender_is_dropped() {
             last_round: 40,
         },
     );
-    scene.take(Input::Receive {
+    scene.handle_input(Input::Receive {
         from: name("gauss"),
         rights: Rights::ALL,
         message,
@@ -665,7 +665,7 @@ fn foreign_sender_is_dropped() {
 /// Times after the start at which a node is followed, as far as its certificate allows it to lead.
 fn is_followed(rights: Rights) -> bool {
     let mut scene = Scene::new(Role::Auto, None);
-    scene.take(Input::MemberAlive {
+    scene.handle_input(Input::MemberAlive {
         member: member("edge", 2),
     });
     for _ in 0..10 {
@@ -679,7 +679,7 @@ fn is_followed(rights: Rights) -> bool {
             life: LifeSign::default(),
         };
         let message = scene.message(Epoch::new(7, name("edge")), body);
-        scene.take(Input::Receive {
+        scene.handle_input(Input::Receive {
             from: name("edge"),
             rights,
             message,
@@ -727,7 +727,7 @@ fn follower_priority_declares_no_role() {
         message.candidacy.role,
         message.candidacy.priority,
     ) = (None, Role::Cav, 100);
-    scene.take(Input::Receive {
+    scene.handle_input(Input::Receive {
         from: name("edge"),
         rights: Rights::NONE,
         message,
@@ -752,7 +752,7 @@ fn vouching_follower_declares_no_role() {
     let mut message = scene.message(Epoch::new(7, name("edge")), body);
     message.candidacy.role = Role::Cav;
     message.candidacy.priority = 100;
-    scene.take(Input::Receive {
+    scene.handle_input(Input::Receive {
         from: name("edge"),
         rights: Rights::NONE,
         message,
@@ -767,16 +767,16 @@ fn vouching_follower_declares_no_role() {
 fn excess_role_takes_no_lead() {
     for (role, is_offered) in [(Role::Edge, true), (Role::Auto, false)] {
         let mut scene = Scene::new(Role::Auto, None);
-        scene.take(Input::OwnBroker {
+        scene.handle_input(Input::OwnBroker {
             address: Some(broker(1)),
         });
-        scene.take(Input::LinkChanged {
+        scene.handle_input(Input::LinkChanged {
             broker: broker(1).into(),
             state: LinkState::Up,
         });
         scene.run_for(2000);
         assert!(scene.machine.election().is_leading());
-        scene.take(Input::MemberAlive {
+        scene.handle_input(Input::MemberAlive {
             member: member("zeno", 2),
         });
         for _ in 0..100 {
@@ -795,7 +795,7 @@ fn excess_role_takes_no_lead() {
                 priority: 100,
                 ..Rights::from(role)
             };
-            scene.take(Input::Receive {
+            scene.handle_input(Input::Receive {
                 from: name("zeno"),
                 rights,
                 message,

@@ -34,7 +34,7 @@ impl PublisherFilter {
         match leadership.leader() {
             None => true,
             Some(leader) if leader == name => {
-                self.note(name, now);
+                self.record(name, now);
                 true
             }
             Some(_) => [&self.last, &self.before]
@@ -46,7 +46,7 @@ impl PublisherFilter {
         }
     }
 
-    fn note(&mut self, name: &NodeName, now: Timestamp) {
+    fn record(&mut self, name: &NodeName, now: Timestamp) {
         if self.last.as_ref().is_some_and(|last| last.name != *name) {
             self.before = self.last.take();
         }

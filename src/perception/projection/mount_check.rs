@@ -53,7 +53,7 @@ impl MountCheck {
     /// Returns the angle in radians by which the camera points higher than its mount states, at
     /// most twice a second. Returns `None` if the stated errors explain the angle, or if objects at
     /// several distances do not agree.
-    pub fn take<'a>(
+    pub fn add<'a>(
         &mut self,
         boxes: impl IntoIterator<Item = (&'a Detection, Cut)>,
         captured_at: Timestamp,

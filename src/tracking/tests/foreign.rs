@@ -57,7 +57,7 @@ fn foreign_object_keeps_identity_and_velocity() {
         let x_m = frame as f64 - 20.0;
         if frame % 5 == 0 && frame <= 15 {
             let car = stated("west", 0.1, foreign_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
-            tracker.take_neighbours(std::slice::from_ref(&car), at(frame));
+            tracker.on_neighbours(std::slice::from_ref(&car), at(frame));
             assert_eq!(
                 tracker.hides(&car),
                 frame > 10,
@@ -133,7 +133,7 @@ fn two_cells(later: u64) -> [Vec<Uuid>; 2] {
                 let theirs = before[1 - number]
                     .iter()
                     .map(|object| stated("other", 0.1, object.clone()));
-                cell.take_neighbours(&theirs.collect::<Vec<_>>(), at(frame));
+                cell.on_neighbours(&theirs.collect::<Vec<_>>(), at(frame));
             }
             for node in ["euclid", "gauss"] {
                 let cars =
@@ -207,7 +207,7 @@ fn lied_to(
     let mut objects: Vec<FusedObject> = Vec::new();
     for frame in 0..120 {
         if frame % 2 == 0 {
-            tracker.take_neighbours(&lie(frame, &objects), at(frame));
+            tracker.on_neighbours(&lie(frame, &objects), at(frame));
         }
         for node in ["euclid", "gauss", "noether"] {
             let cars = (0..6).map(|place| {
@@ -247,7 +247,7 @@ fn unconfirmed_cell_loses_trust() {
     assert!(tracker.hides(&ghost(1)));
     // The ghost is not handed over: a car that comes to its position has an identity of this cell.
     for frame in 120..125 {
-        tracker.take_neighbours(&[ghost(1)], at(frame));
+        tracker.on_neighbours(&[ghost(1)], at(frame));
         tracker.observe(
             watching("euclid", frame, vec![car(-16.0, -20.0)]),
             at(frame),

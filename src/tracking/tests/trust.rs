@@ -59,7 +59,7 @@ fn observers_precede_vehicles_that_miss() {
     let mut sensors = Sensors::new(ReputationConfig::default());
     let mut id = |n: u32| {
         sensors
-            .hear(&name(&format!("v{n}")), at(0), &TracksConfig::default())
+            .receive(&name(&format!("v{n}")), at(0), &TracksConfig::default())
             .0
             .id
     };

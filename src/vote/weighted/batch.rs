@@ -41,7 +41,7 @@ impl WeightedVoting {
         self.model.label_bias = label_bias;
         self.model.refresh(std::iter::empty());
         let calibration = std::mem::replace(&mut self.calibration, settled);
-        self.calibration.take_live(calibration);
+        self.calibration.merge_live(calibration);
     }
 
     /// One pass: evaluates every landmark by the same evidence, then replaces the live evidence.
@@ -60,7 +60,7 @@ impl WeightedVoting {
                 &landmark_votes.weighted_votes(),
                 &landmark_votes.candidates(),
             );
-            landmark_votes.take(judged, &mut self.calibration);
+            landmark_votes.adopt_posterior(judged, &mut self.calibration);
         }
         self.model.clear_live();
         for &landmark in &landmarks {

@@ -439,7 +439,7 @@ impl World {
         match effect {
             Effect::PersistTerm { term } => self.nodes[index].persisted = term,
             Effect::Send { to, message } => self.send(index, &to, &message),
-            Effect::TellLeadership { leadership } => {
+            Effect::PublishLeadership { leadership } => {
                 let follows = matches!(
                     leadership.position,
                     Position::Following | Position::StandingBy

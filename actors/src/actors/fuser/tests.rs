@@ -93,7 +93,7 @@ async fn forged_map_replaces_no_leader() {
         let mut fuser = standby();
         let mut maps = 0;
         while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
-            fuser.take_map(map, received_at);
+            fuser.on_map(map, received_at);
             maps += 1;
         }
         assert_eq!(
@@ -111,7 +111,7 @@ async fn expelled_leaders_map_is_dropped() {
     let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
         panic!("a map")
     };
-    fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
+    fuser.on_map(Arc::clone(&delivery.message), Timestamp(1));
     fuser.expel(&NodeName::from_static("gauss"));
     assert!(fuser.last_map.is_some(), "another's");
     fuser.expel(&NodeName::from_static("edge"));
@@ -136,7 +136,7 @@ fn take(
         kind: ReportKind::Detections,
         report: Arc::new(report),
     };
-    fuser.take(&Delivery::local(message, received_at));
+    fuser.on_delivery(&Delivery::local(message, received_at));
 }
 
 /// A wrong clock is reported with its error, both while the reports are refused and later, when
@@ -405,6 +405,6 @@ fn one_sided_landmarks_are_reported() {
         kind: ReportKind::VoteDetections,
         report: Arc::new(ObjectReport { seen, ..report(1) }),
     };
-    votes.take(&Delivery::local(message, now));
+    votes.on_delivery(&Delivery::local(message, now));
     assert_eq!(troubles(&votes), unknown);
 }

@@ -120,10 +120,10 @@ impl ElectionDriver {
         }
     }
 
-    pub(super) async fn take_event(&mut self, event: MembershipEvent) {
+    pub(super) async fn on_membership_event(&mut self, event: MembershipEvent) {
         if let MembershipEvent::Alive { member } | MembershipEvent::Changed { member } = &event {
             self.life_signs
-                .meet(&member.name, member.certificate.as_ref());
+                .member_up(&member.name, member.certificate.as_ref());
         }
         let input = match event {
             MembershipEvent::Alive { member } => Input::MemberAlive {
@@ -177,7 +177,7 @@ impl ElectionDriver {
                 }
             },
             MembershipEvent::Troubled { about, kind, cause } => {
-                return self.counters.troubles().note_about(&about, kind, &cause);
+                return self.counters.troubles().record_about(&about, kind, &cause);
             }
             // The node ends with this error.
             MembershipEvent::Excluded => return,
@@ -186,7 +186,7 @@ impl ElectionDriver {
     }
 
     /// Processes another node's status: its own state, and the leader's complaints about this node.
-    pub(super) async fn take_status(&mut self, status: &NodeStatus) {
+    pub(super) async fn on_status(&mut self, status: &NodeStatus) {
         if self.leadership.borrow().leader() == Some(&status.node) && status.node != self.name {
             let of_this = |trouble: &&Trouble| {
                 let about = trouble
@@ -247,7 +247,7 @@ impl ElectionDriver {
                     .membership
                     .send(MembershipMessage::Send { to, payload });
             }
-            Effect::TellLeadership { leadership } => self.tell(leadership),
+            Effect::PublishLeadership { leadership } => self.tell(leadership),
             Effect::Lead {
                 epoch,
                 first_round,
@@ -302,7 +302,7 @@ impl ElectionDriver {
                 events.into_iter().for_each(log_clock);
                 self.live_state
                     .check_members(&self.members.borrow(), clock::now());
-                self.note_troubles();
+                self.update_troubles();
                 let mut dismissed = self.live_state.expected().dismissed();
                 if self.is_visitor {
                     dismissed.truncate(MAX_DISMISSED - 1);
@@ -366,7 +366,7 @@ impl ElectionDriver {
 
     /// Records troubles: wrong clocks, missing nodes, the leader's complaint, the end of the node's
     /// own certificate, and an unused description of the cell.
-    fn note_troubles(&mut self) {
+    fn update_troubles(&mut self) {
         let troubles = self.counters.troubles();
         let leadership = self.leadership.borrow();
         let mut is_clock_wrong = false;
@@ -374,7 +374,7 @@ impl ElectionDriver {
             is_clock_wrong |= clock.node.is_none();
             if clock.node.is_none() || leadership.is_leading() {
                 let about = clock.node.map(NodeName::as_str);
-                troubles.note_with_remedy(
+                troubles.record_with_remedy(
                     about,
                     TroubleKind::ClockOff,
                     &clock_words(&clock),
@@ -384,9 +384,9 @@ impl ElectionDriver {
         }
         for name in &self.no_login {
             let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
-            troubles.note_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
+            troubles.record_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
         }
-        let missing = note_missing(&self.live_state.expected().missing(), troubles);
+        let missing = report_missing_nodes(&self.live_state.expected().missing(), troubles);
         for returned in self.missing.difference(&missing) {
             troubles.settle(TroubleKind::NodeMissing, Some(returned.as_str()));
         }
@@ -396,14 +396,14 @@ impl ElectionDriver {
             .filter(|(leader, _)| leadership.leader() == Some(leader));
         if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
             let cause = format!("reported by {leader}: {cause}");
-            troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
+            troubles.record_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
         }
         if let Some(credentials) = self.life_signs.credentials() {
             credentials.set_clock_wrong(is_clock_wrong);
-            note_certificates(credentials, troubles);
+            report_certificates(credentials, troubles);
         }
         match &self.parts.shared.borrow().problem {
-            Some(problem) => troubles.note(TroubleKind::Description, problem),
+            Some(problem) => troubles.record(TroubleKind::Description, problem),
             None => troubles.settle(TroubleKind::Description, None),
         }
         drop(leadership);
@@ -467,7 +467,7 @@ fn as_seen(member: &Member) -> node::SeenMember {
 }
 
 /// Records the nodes that have been missing for long enough; returns their names.
-fn note_missing(nodes: &[MissingNode], troubles: &Troubles) -> BTreeSet<NodeName> {
+fn report_missing_nodes(nodes: &[MissingNode], troubles: &Troubles) -> BTreeSet<NodeName> {
     let now = clock::now();
     let missing = nodes
         .iter()
@@ -475,7 +475,7 @@ fn note_missing(nodes: &[MissingNode], troubles: &Troubles) -> BTreeSet<NodeName
     missing
         .map(|node| {
             let cause = missing_words(now.since(node.last_seen), clock::wall());
-            troubles.note_about(node.name.as_str(), TroubleKind::NodeMissing, &cause);
+            troubles.record_about(node.name.as_str(), TroubleKind::NodeMissing, &cause);
             node.name.clone()
         })
         .collect()
@@ -494,19 +494,19 @@ fn missing_words(absence: Duration, wall: Timestamp) -> String {
 }
 
 /// Records that the node's certificate ends soon and is not renewed, and that the cell's CA ends.
-fn note_certificates(credentials: &Credentials, troubles: &Troubles) {
+fn report_certificates(credentials: &Credentials, troubles: &Troubles) {
     let current = credentials.current();
     let now = clock::wall();
     let left = current.identity.due_for_renewal(now);
     match left.zip(credentials.unrenewed()) {
         Some((left, why)) => {
             let cause = format!("{}: {why}", ending("this node's certificate", left));
-            troubles.note(TroubleKind::CertificateEnds, &cause);
+            troubles.record(TroubleKind::CertificateEnds, &cause);
         }
         None => troubles.settle(TroubleKind::CertificateEnds, None),
     }
     match current.ca_validity.remaining_within(CA_MARGIN, now) {
-        Some(left) => troubles.note(TroubleKind::CaEnds, &ending("the cell's CA", left)),
+        Some(left) => troubles.record(TroubleKind::CaEnds, &ending("the cell's CA", left)),
         None => troubles.settle(TroubleKind::CaEnds, None),
     }
 }

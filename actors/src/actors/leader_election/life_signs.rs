@@ -46,7 +46,7 @@ impl LifeSigns {
     }
 
     /// Stores the certificate of a node that has proven it.
-    pub(super) fn meet(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
+    pub(super) fn member_up(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
         let Some(certificate) = certificate else {
             return;
         };
@@ -197,7 +197,7 @@ mod tests {
             !seeker.is_proven(&evidence(life_of(&edge, 500))),
             "a leader that was never met"
         );
-        seeker.meet(
+        seeker.member_up(
             &NodeName::from_static("edge"),
             Some(&edge.current().certificate().into()),
         );

@@ -44,7 +44,7 @@ impl ReputationStore {
     /// Loads saved evidence, within the bounds for other nodes' evidence. If evidence is signed,
     /// `signer` verifies it. `date` is the current time; an unset clock is not used for
     /// checks.
-    fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
+    fn adopt(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
         let Saved {
             entries,
             marks,
@@ -257,7 +257,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {
         let date = arguments.clock.date(clock::now());
-        store.take(saved, signer, date);
+        store.adopt(saved, signer, date);
         tracing::info!(path = %file.path().display(), entries = store.ledger.entries().count(), "reputations restored");
     }
 }
@@ -267,7 +267,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
 pub fn read_saved(bytes: &[u8]) {
     if let Ok(saved) = serde_json::from_slice(bytes) {
         let store = SharedReputations::new(true);
-        store.open().take(saved, None, EARLIEST);
+        store.open().adopt(saved, None, EARLIEST);
         drop(store.open().reputations(&ReputationConfig::default()));
     }
 }

@@ -36,7 +36,7 @@ impl MapPace {
     }
 
     /// Records that a neighbour's map was accepted.
-    pub(super) fn note_neighbour(&mut self, now: Timestamp) {
+    pub(super) fn record_neighbour(&mut self, now: Timestamp) {
         self.neighbour_at = Some(now);
     }
 
@@ -85,7 +85,7 @@ mod tests {
         let mut pace = MapPace::new(2.0);
         assert_eq!(count(&mut pace, 5_000), 21, "the first at once");
         assert_eq!(count(&mut pace, 15_000), 20);
-        pace.note_neighbour(Timestamp(25_000_000));
+        pace.record_neighbour(Timestamp(25_000_000));
         let beside = count(&mut pace, 25_000);
         assert!(
             (54..=60).contains(&beside),

@@ -608,7 +608,7 @@ mod tests {
         let held = HeldDescription::default();
         NodeBuilder::new(
             vehicle,
-            Presence::Whole,
+            Presence::Active,
             config,
             Security::default(),
             held,

@@ -25,7 +25,7 @@ impl NodeBuilder {
         if let Some(config) = self.held.lay_over(&self.own_config) {
             let before = std::mem::replace(&mut self.config, config);
             self.configure_parts(&before);
-            self.note_units();
+            self.check_units();
             tracing::info!(stamp = %description.stamp(), "the description of the cell is used");
         }
         self.configure_uplink();
@@ -43,11 +43,11 @@ impl NodeBuilder {
     }
 
     /// Records values that look as if they were in another unit.
-    pub(super) fn note_units(&self) {
+    pub(super) fn check_units(&self) {
         let troubles = self.vehicle.counters.troubles();
         for (kind, cause) in self.config.doubtful_units() {
             match cause {
-                Some(cause) => troubles.note(kind, &cause),
+                Some(cause) => troubles.record(kind, &cause),
                 None => troubles.settle(kind, None),
             }
         }

@@ -185,7 +185,7 @@ impl NodeMonitor {
         let mut next_snapshot = Instant::now();
         let mut changed = true;
         let mut sent_at = Instant::now();
-        self.take_leadership();
+        self.on_leadership();
         loop {
             let due = if changed {
                 next_snapshot
@@ -194,16 +194,16 @@ impl NodeMonitor {
             };
             tokio::select! {
                 Ok(()) = leadership.changed() => {
-                    self.take_leadership();
+                    self.on_leadership();
                     self.request_reports();
                     changed = true;
                 }
                 Ok(()) = maps.changed() => {
-                    self.take_map();
+                    self.on_map();
                     changed = true;
                 }
                 Ok(()) = verdicts.changed() => {
-                    self.take_verdicts();
+                    self.on_verdicts();
                     changed = true;
                 }
                 Ok(()) = members.changed() => changed = true,
@@ -231,14 +231,14 @@ impl NodeMonitor {
         }
     }
 
-    fn take_leadership(&self) {
+    fn on_leadership(&self) {
         let leadership = self.sources.vitals.leadership.borrow().clone();
         self.observed()
             .history
             .add_leadership(&leadership, clock::now());
     }
 
-    fn take_map(&self) {
+    fn on_map(&self) {
         let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else {
             return;
         };
@@ -257,7 +257,7 @@ impl NodeMonitor {
     }
 
     /// In a cell without maps, verdicts count as the round.
-    fn take_verdicts(&self) {
+    fn on_verdicts(&self) {
         let Some(newest) = self.sources.vitals.newest.verdicts.borrow().clone() else {
             return;
         };

@@ -145,7 +145,7 @@ impl LogSender {
         };
         if let Some(lost) = lost {
             self.count_lost(1, u64::from(lost.item.is_of_journal()));
-            self.note_incomplete("entries are missing in the log: the disk is too slow for them");
+            self.record_incomplete("entries are missing in the log: the disk is too slow for them");
         }
     }
 
@@ -165,11 +165,11 @@ impl LogSender {
     }
 
     /// Records that the log is incomplete.
-    pub(crate) fn note_incomplete(&self, cause: &str) {
+    pub(crate) fn record_incomplete(&self, cause: &str) {
         self.0
             .counters
             .troubles()
-            .note(TroubleKind::NotRecorded, cause);
+            .record(TroubleKind::NotRecorded, cause);
     }
 
     /// Journal entries lost since the last call.

@@ -238,7 +238,7 @@ impl LogWriter {
             other => other.to_string(),
         };
         self.recording
-            .note_incomplete(&format!("nothing is recorded in {directory}: {error}"));
+            .record_incomplete(&format!("nothing is recorded in {directory}: {error}"));
         if !std::mem::replace(&mut self.failing, true) {
             tracing::warn!(%directory, error, "not recording, the node goes on; trying again every {} s", RETRY_AFTER.as_secs());
         }

@@ -170,7 +170,7 @@ impl AddressTable {
     }
 
     /// Raises the rate of an address from which a client is, or was until now, logged in.
-    fn note_login(&mut self, source: IpAddr, now: Timestamp) {
+    fn record_login(&mut self, source: IpAddr, now: Timestamp) {
         let burst = self.burst.saturating_mul(PRIVILEGED_FACTOR);
         let interval = self.interval / PRIVILEGED_FACTOR;
         let Some(entry) = self.entry(source, now) else {
@@ -192,7 +192,9 @@ impl LoginSlot {
 
     /// Frees the place: the client has logged in.
     pub(super) fn log_in(self) -> LoggedInConnection {
-        self.throttle.table().note_login(self.source, clock::now());
+        self.throttle
+            .table()
+            .record_login(self.source, clock::now());
         LoggedInConnection {
             throttle: self.throttle.clone(),
             source: self.source,
@@ -208,7 +210,9 @@ impl Drop for LoginSlot {
 
 impl Drop for LoggedInConnection {
     fn drop(&mut self) {
-        self.throttle.table().note_login(self.source, clock::now());
+        self.throttle
+            .table()
+            .record_login(self.source, clock::now());
     }
 }
 

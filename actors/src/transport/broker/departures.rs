@@ -35,7 +35,7 @@ struct Departed {
 
 impl Departures {
     /// Records that a client has left.
-    pub(super) fn note(
+    pub(super) fn record(
         &self,
         name: NodeName,
         certificate: CertificateDer<'static>,
@@ -125,8 +125,8 @@ mod tests {
         });
         let departures = Departures::default();
         let at = |seconds| Timestamp(0) + Duration::from_secs(seconds);
-        departures.note(gauss.clone(), certificates[0].clone(), at(1));
-        departures.note(euclid.clone(), certificates[1].clone(), at(1));
+        departures.record(gauss.clone(), certificates[0].clone(), at(1));
+        departures.record(euclid.clone(), certificates[1].clone(), at(1));
         let taken = |authority: &Authority, seconds| {
             let clients = load(authority, &euclid).clients.clone();
             departures.take_distrusted(&*clients, at(seconds))
@@ -135,12 +135,12 @@ mod tests {
         authority.revoke(&gauss, clock::now()).unwrap();
         assert_eq!(taken(&authority, 3), std::slice::from_ref(&gauss));
         assert_eq!(taken(&authority, 3), []);
-        departures.note(gauss.clone(), certificates[0].clone(), at(4));
+        departures.record(gauss.clone(), certificates[0].clone(), at(4));
         assert_eq!(taken(&authority, 65), [], "nothing of it is left");
         for number in 0..=MAX_CLIENTS {
             let name = NodeName::new(format!("v{number}")).unwrap();
             certificates.swap(0, 1);
-            departures.note(name, certificates[0].clone(), at(100 + number as u64 / 100));
+            departures.record(name, certificates[0].clone(), at(100 + number as u64 / 100));
         }
         assert_eq!(departures.clients().len(), MAX_CLIENTS);
     }

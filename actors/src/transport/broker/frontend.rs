@@ -262,7 +262,7 @@ impl FrontendState {
         };
         let _part = self
             .quota
-            .take(&principal)
+            .acquire(&principal)
             .ok_or(ClientRejection::Crowded)?;
         let _place = Arc::clone(&self.places)
             .try_acquire_owned()
@@ -284,14 +284,14 @@ impl FrontendState {
         };
         if let (Some(identity), Some(own)) = (&principal.identity, certificates.into_iter().next())
         {
-            self.note_end(identity.name(), own, &ended);
+            self.record_end(identity.name(), own, &ended);
         }
         ended
     }
 
     /// Reports a client that was disconnected because its certificate is not trusted any more, and
     /// records any other client that has left.
-    fn note_end(
+    fn record_end(
         &self,
         name: &NodeName,
         certificate: CertificateDer<'static>,
@@ -304,7 +304,7 @@ impl FrontendState {
             Err(ClientRejection::CertificateInvalidated(_)) => {}
             _ => self
                 .departures
-                .note(name.clone(), certificate, clock::now()),
+                .record(name.clone(), certificate, clock::now()),
         }
     }
 }

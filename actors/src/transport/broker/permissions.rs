@@ -113,7 +113,7 @@ impl Permissions {
         if self.door.is_program(&principal, &session.id.client_id) {
             self.check_limits(topic, retain, bytes)
                 .map_err(DoorRefusal::not_permitted)?;
-            return self.door.take(&principal, place, topic, publish);
+            return self.door.on_publish(&principal, place, topic, publish);
         }
         if place != TopicPlace::Cell || !self.allows(&principal, topic, retain, bytes) {
             return Err(refused());
@@ -122,7 +122,7 @@ impl Permissions {
             // A vehicle without a node, by its certificate.
             Some(Topic::Boxes(name)) => {
                 self.door
-                    .take_boxes(&name, BoxRoute::Broker, &publish.payload)
+                    .on_boxes(&name, BoxRoute::Broker, &publish.payload)
             }
             _ => Ok(()),
         }
@@ -168,7 +168,7 @@ impl Permissions {
         Ok(())
     }
 
-    fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
+    fn record_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
         let client = &session.id.client_id;
         let topic = TopicPlace::of(&publish.topic).1;
         let principal = self.principals.principal(session.id.remote_addr);
@@ -176,7 +176,7 @@ impl Permissions {
             .as_ref()
             .is_some_and(|principal| self.door.is_program(principal, client))
         {
-            return self.door.note_refusal(client, topic, refusal);
+            return self.door.record_refusal(client, topic, refusal);
         }
         let identity = principal.and_then(|principal| principal.identity);
         let may_lead = identity.is_some_and(|identity| identity.may_serve());
@@ -245,7 +245,7 @@ impl Handler for Permissions {
                 HookResult::PublishAclResult(match self.check_publish(session, publish) {
                     Ok(()) => PublishAclResult::allow(),
                     Err(refusal) => {
-                        self.note_refusal(session, publish, &refusal);
+                        self.record_refusal(session, publish, &refusal);
                         refusal.answer()
                     }
                 })

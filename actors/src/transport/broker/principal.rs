@@ -191,7 +191,7 @@ impl PrincipalRegistry {
 
     /// Records that a connection has started or ended a subscription. A repeated subscription
     /// counts once.
-    pub(super) fn note_subscription(
+    pub(super) fn record_subscription(
         &self,
         address: Option<SocketAddr>,
         filter: &TopicFilter,
@@ -266,7 +266,7 @@ impl ConnectionQuota {
     }
 
     /// A place for one more connection of the principal, if there is one left.
-    pub(super) fn take(&self, principal: &Principal) -> Option<ConnectionPermit> {
+    pub(super) fn acquire(&self, principal: &Principal) -> Option<ConnectionPermit> {
         let Some(quota_key) = &principal.quota_key else {
             return Some(None);
         };
@@ -293,14 +293,14 @@ mod tests {
     #[test]
     fn remote_address_connections_are_limited() {
         let quota = ConnectionQuota::new(2);
-        let take = |address: &str| quota.take(&at(address));
-        let held = [take("10.0.0.1"), take("::ffff:10.0.0.1")];
-        assert!(held.iter().all(Option::is_some) && take("10.0.0.1").is_none());
-        assert!(take("10.0.0.2").is_some(), "another's share is its own");
-        let here: Vec<_> = (0..100).map_while(|_| take("127.0.0.1")).collect();
+        let acquire = |address: &str| quota.acquire(&at(address));
+        let held = [acquire("10.0.0.1"), acquire("::ffff:10.0.0.1")];
+        assert!(held.iter().all(Option::is_some) && acquire("10.0.0.1").is_none());
+        assert!(acquire("10.0.0.2").is_some(), "another's share is its own");
+        let here: Vec<_> = (0..100).map_while(|_| acquire("127.0.0.1")).collect();
         assert_eq!(here.len(), 100);
         drop(held);
-        assert!(take("10.0.0.1").is_some() && take("10.0.0.3").is_some());
+        assert!(acquire("10.0.0.1").is_some() && acquire("10.0.0.3").is_some());
         assert_eq!(
             quota.connections.lock().unwrap().len(),
             1,
@@ -313,9 +313,9 @@ mod tests {
         let quota = ConnectionQuota::new(1);
         let node = at("10.0.0.1");
         let programs = at("10.0.0.1").programs();
-        let held = quota.take(&programs);
-        assert!(held.is_some() && quota.take(&programs).is_none());
-        assert!(quota.take(&node).is_some());
+        let held = quota.acquire(&programs);
+        assert!(held.is_some() && quota.acquire(&programs).is_none());
+        assert!(quota.acquire(&node).is_some());
         assert_ne!(node.source(), programs.source());
         assert!(
             at("127.0.0.1").programs().quota_key().is_none(),

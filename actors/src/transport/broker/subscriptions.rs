@@ -67,10 +67,14 @@ impl Handler for SharedQuota {
         } = &*self.0;
         match parameter {
             Parameter::SessionSubscribed(session, subscribe) => {
-                principals.note_subscription(session.id.remote_addr, &subscribe.topic_filter, true);
+                principals.record_subscription(
+                    session.id.remote_addr,
+                    &subscribe.topic_filter,
+                    true,
+                );
             }
             Parameter::SessionUnsubscribed(session, unsubscribe) => {
-                principals.note_subscription(
+                principals.record_subscription(
                     session.id.remote_addr,
                     &unsubscribe.topic_filter,
                     false,

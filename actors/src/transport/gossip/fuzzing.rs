@@ -19,7 +19,7 @@ use super::key::{BROADCAST, CellKey, Cookie, SessionId, session_of};
 use super::machine::{GossipMachine, GossipOutput, GossipSetup};
 use super::node_id::NodeId;
 use super::sessions::{decode, decode_first, encode};
-use super::trial_authority::TrialAuthority;
+use super::test_authority::TestAuthority;
 
 /// Start time, in microseconds since 1970.
 const START: u64 = 1_700_000_000_000_000;
@@ -31,7 +31,7 @@ const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010
 
 /// Certificates of both nodes, made once.
 static IDENTITIES: LazyLock<[Identity; 2]> = LazyLock::new(|| {
-    let mut authority = TrialAuthority::new();
+    let mut authority = TestAuthority::new();
     [OWN, PEER].map(|name| authority.identity(name, Role::Auto))
 });
 
@@ -128,14 +128,14 @@ impl Listener {
     }
 
     /// Processes a datagram from the peer's address.
-    pub fn hear(&mut self, frame: &[u8]) {
+    pub fn receive(&mut self, frame: &[u8]) {
         self.own.receive(frame, address(1), self.now);
         self.settle();
     }
 
     /// Processes a body sealed by the cell's key in the peer's session, or as a frame of a cell
     /// with the other version.
-    pub fn hear_sealed(&mut self, kind: u8, body: &[u8]) {
+    pub fn receive_sealed(&mut self, kind: u8, body: &[u8]) {
         let [own, peer] = self.sessions;
         let (kind, to, version) = match kind % 5 {
             0 => (FrameKind::Hello, BROADCAST, self.version),
@@ -152,38 +152,38 @@ impl Listener {
             counter: self.forged,
         };
         let frame = head.write(self.key.tag(), body, &self.key.seal(&peer, &to));
-        self.hear(&frame);
+        self.receive(&frame);
     }
 
     /// Processes a greeting of the peer, which the node answers with a challenge unless it has a
     /// session with the peer.
-    pub fn hear_greeting(&mut self, wants_session: bool) {
+    pub fn receive_greeting(&mut self, wants_session: bool) {
         let mut body = encode(&Hello { name: name(PEER) });
         if self.prover.is_some() {
             body.extend(encode(&Greeting { wants_session }));
         }
-        self.hear_sealed(0, &body);
+        self.receive_sealed(0, &body);
     }
 
     /// Processes a challenge of the peer, which the node answers with its proof.
-    pub fn hear_challenge(&mut self, edits: &Edits) {
+    pub fn receive_challenge(&mut self, edits: &Edits) {
         let challenge = encode(&Handshake::Challenge {
             cookie: PEER_COOKIE,
             name: name(PEER),
         });
-        self.hear_sealed(1, &edited(challenge, edits));
+        self.receive_sealed(1, &edited(challenge, edits));
     }
 
     /// Processes the peer's proof with the node's last cookie. The peer signs the edited message;
     /// then the attestation is edited.
-    pub fn hear_proof(&mut self, message: &Edits, attestation: &Edits) {
+    pub fn receive_proof(&mut self, message: &Edits, attestation: &Edits) {
         let Some(echo) = self.challenge else { return };
         let proof = Handshake::Proof {
             echo,
             cookie: PEER_COOKIE,
             introduction: introduction(),
         };
-        self.hear_signed(
+        self.receive_signed(
             Side::Prover,
             OWN.as_bytes(),
             edited(encode(&proof), message),
@@ -192,7 +192,7 @@ impl Listener {
     }
 
     /// Processes the peer's accept of the node's last proof, in the same way.
-    pub fn hear_accept(&mut self, message: &Edits, attestation: &Edits) {
+    pub fn receive_accept(&mut self, message: &Edits, attestation: &Edits) {
         let Some((echo, proof)) = self.proof else {
             return;
         };
@@ -200,7 +200,7 @@ impl Listener {
             echo,
             introduction: introduction(),
         };
-        self.hear_signed(
+        self.receive_signed(
             Side::Accepter,
             &proof,
             edited(encode(&accept), message),
@@ -208,7 +208,7 @@ impl Listener {
         );
     }
 
-    fn hear_signed(&mut self, side: Side, context: &[u8], mut message: Vec<u8>, edits: &Edits) {
+    fn receive_signed(&mut self, side: Side, context: &[u8], mut message: Vec<u8>, edits: &Edits) {
         let [own, peer] = self.sessions;
         // The frame that comes next.
         let counter = self.forged + 1;
@@ -235,7 +235,7 @@ impl Listener {
             };
             message.extend(edited(encode(&attestation), edits));
         }
-        self.hear_sealed(1, &message);
+        self.receive_sealed(1, &message);
     }
 
     /// Lets time pass.
@@ -259,14 +259,14 @@ impl Listener {
     fn settle(&mut self) {
         while let Some(output) = self.own.poll() {
             if let GossipOutput::Send { frame, .. } = output {
-                self.note_handshake(&frame);
+                self.record_handshake(&frame);
             }
         }
     }
 
     /// Stores the data from the node's handshakes with the peer that the peer needs for its next
     /// step.
-    fn note_handshake(&mut self, frame: &[u8]) -> Option<()> {
+    fn record_handshake(&mut self, frame: &[u8]) -> Option<()> {
         let [own, peer] = self.sessions;
         let head = FrameHeader::read(frame, self.key.tag()).ok()?;
         let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;

@@ -202,7 +202,7 @@ impl GossipMachine {
                 if self.seeds.contains(&from) {
                     self.answered.insert(from);
                 }
-                self.take(opened, from, at, now)
+                self.on_opened_frame(opened, from, at, now)
             }
             Err(reason) => Err(reason),
         };
@@ -307,7 +307,7 @@ impl GossipMachine {
         }
     }
 
-    fn take(
+    fn on_opened_frame(
         &mut self,
         opened: FrameContent,
         from: SocketAddr,
@@ -388,7 +388,7 @@ impl GossipMachine {
         if !speaks {
             return self.report_taken(&id.name, second_run(from), at);
         }
-        self.gossip.note_met(&id);
+        self.gossip.record_member(&id);
         for (kind, body) in self
             .pending
             .remove(&id.name)
@@ -402,7 +402,7 @@ impl GossipMachine {
             .known(&id.name)
             .is_some_and(|known| known.alive && known.life >= id.life);
         if greeter || !alive {
-            self.gossip.meet(id, at);
+            self.gossip.member_up(id, at);
         }
     }
 
@@ -507,12 +507,12 @@ impl GossipMachine {
             self.outputs.push_back(GossipOutput::Multicast { frame });
         }
         self.hello_count += 1;
-        self.tell_silent_seeds();
+        self.report_silent_seeds();
     }
 
     /// Reports the seeds that have not answered several greetings of a node without other members.
     /// Only the other side can detect which side's key or cell is wrong.
-    fn tell_silent_seeds(&mut self) {
+    fn report_silent_seeds(&mut self) {
         self.unanswered = if self.gossip.alive().is_empty() {
             self.unanswered + 1
         } else {

@@ -30,7 +30,7 @@ impl ReplayWindow {
     /// # Errors
     /// Returns [`FrameEvent::Replayed`] if it was accepted before or is too old,
     /// [`FrameEvent::CounterJump`] when it is too far ahead. The window is then as before.
-    pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
+    pub(crate) fn accept(&mut self, counter: u64) -> Result<(), FrameEvent> {
         if let Some(ahead) = counter.checked_sub(self.highest).filter(|ahead| *ahead > 0) {
             if ahead > MAX_JUMP {
                 return Err(FrameEvent::CounterJump);
@@ -71,29 +71,29 @@ mod tests {
     #[test]
     fn late_frames_are_accepted_once() {
         let mut window = ReplayWindow::after(100);
-        let mut take = |counter| window.take(counter).is_ok();
+        let mut accept = |counter| window.accept(counter).is_ok();
         assert!(
-            !take(100) && !take(99) && !take(0),
+            !accept(100) && !accept(99) && !accept(0),
             "before the session began"
         );
-        assert!(take(102) && take(101) && !take(101) && !take(102));
-        assert!(take(102 + 127) && !take(101), "fell out of the window");
-        assert!(take(103) && take(229 + MAX_JUMP) && !take(229 + MAX_JUMP));
+        assert!(accept(102) && accept(101) && !accept(101) && !accept(102));
+        assert!(accept(102 + 127) && !accept(101), "fell out of the window");
+        assert!(accept(103) && accept(229 + MAX_JUMP) && !accept(229 + MAX_JUMP));
     }
 
     #[test]
     fn counter_jump_needs_handshake() {
         let mut window = ReplayWindow::after(100);
         for counter in [u64::MAX, 101 + MAX_JUMP] {
-            assert_eq!(window.take(counter), Err(FrameEvent::CounterJump));
+            assert_eq!(window.accept(counter), Err(FrameEvent::CounterJump));
         }
-        assert_eq!(window.take(101), Ok(()));
+        assert_eq!(window.accept(101), Ok(()));
         window.skip_to(u64::MAX - 1);
-        assert_eq!(window.take(102), Err(FrameEvent::Replayed));
-        assert_eq!(window.take(u64::MAX), Ok(()));
+        assert_eq!(window.accept(102), Err(FrameEvent::Replayed));
+        assert_eq!(window.accept(u64::MAX), Ok(()));
         window.skip_to(5);
         assert_eq!(
-            window.take(u64::MAX),
+            window.accept(u64::MAX),
             Err(FrameEvent::Replayed),
             "nothing goes back"
         );
@@ -106,7 +106,7 @@ mod tests {
             let mut taken = BTreeSet::new();
             for counter in counters {
                 let recent = taken.last().is_none_or(|highest| counter + 128 > *highest) && counter + 128 > floor;
-                let new = window.take(counter).is_ok();
+                let new = window.accept(counter).is_ok();
                 prop_assert_eq!(new, counter > floor && recent && !taken.contains(&counter));
                 if new {
                     taken.insert(counter);

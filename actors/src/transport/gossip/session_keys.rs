@@ -57,15 +57,15 @@ impl KeyRing {
         self.sets.iter_mut().find_map(|keys| {
             let body = keys.from.open(head.counter, open, sealed)?;
             keys.is_confirmed = true;
-            Some((body, keys.window.take(head.counter)))
+            Some((body, keys.window.accept(head.counter)))
         })
     }
 
     /// Records the counter of a frame that was opened by other means.
-    pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
+    pub(crate) fn accept(&mut self, counter: u64) -> Result<(), FrameEvent> {
         self.sets
             .first_mut()
-            .map_or(Ok(()), |keys| keys.window.take(counter))
+            .map_or(Ok(()), |keys| keys.window.accept(counter))
     }
 
     /// Continues after a counter that a handshake has proven.

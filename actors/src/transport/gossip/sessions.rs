@@ -302,7 +302,7 @@ impl Sessions {
     ) -> Result<FrameContent, FrameEvent> {
         let head = FrameHeader::read(frame, self.key.tag()).inspect_err(|reason| {
             if *reason == FrameEvent::WrongCell {
-                self.note_other_cell(frame, arrival);
+                self.record_other_cell(frame, arrival);
             }
         })?;
         if head.version != self.version() {
@@ -318,7 +318,7 @@ impl Sessions {
         match head.kind {
             FrameKind::Hello => {
                 let Some(body) = self.unseal(&head, &BROADCAST, frame) else {
-                    self.note_other_key(arrival.from);
+                    self.record_other_key(arrival.from);
                     return Err(FrameEvent::BadSeal);
                 };
                 let (hello, rest) = decode_first::<Hello>(&body)?;
@@ -331,7 +331,8 @@ impl Sessions {
                     .unseal(&head, &self.own, frame)
                     .ok_or(FrameEvent::BadSeal)?;
                 if !self.prove_certificates() {
-                    self.peers.take_counter(&head, arrival.from, arrival.now)?;
+                    self.peers
+                        .accept_counter(&head, arrival.from, arrival.now)?;
                 }
                 self.handle_handshake(&head, &body, arrival)
             }
@@ -364,7 +365,7 @@ impl Sessions {
         };
         match taken {
             Ok(()) if !peer.frames.allow(now) => return Err(FrameEvent::Throttled),
-            Ok(()) => peer.note_heard(now),
+            Ok(()) => peer.record_received(now),
             Err(FrameEvent::CounterJump) => return Ok(self.stranger(FrameEvent::CounterJump)),
             Err(reason) => return Err(reason),
         }
@@ -407,7 +408,7 @@ impl Sessions {
     }
 
     /// Records a greeting under another key.
-    fn note_other_key(&mut self, from: SocketAddr) {
+    fn record_other_key(&mut self, from: SocketAddr) {
         let cause = format!(
             "received a datagram of cell {} with another key or none from {}",
             self.cell,
@@ -418,7 +419,7 @@ impl Sessions {
 
     /// Records a cell with a similar name. Numbered cells may be neighbours, unless this node has
     /// found no other node.
-    fn note_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
+    fn record_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
         let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else {
             return;
         };

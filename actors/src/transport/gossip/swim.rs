@@ -163,7 +163,7 @@ impl Swim {
         let Some((count, mut rest)) = updates.split_first_chunk::<2>() else {
             return Ok(body.to_vec());
         };
-        self.note_met(from);
+        self.record_member(from);
         let mut kept = body
             .get(..body.len() - updates.len())
             .unwrap_or_default()
@@ -215,14 +215,14 @@ impl Swim {
     }
 
     /// Announces this node to a node that was just admitted.
-    pub(crate) fn meet(&mut self, peer: NodeId, now: Timestamp) {
-        self.note_met(&peer);
+    pub(crate) fn member_up(&mut self, peer: NodeId, now: Timestamp) {
+        self.record_member(&peer);
         let announced = self.foca.announce(peer, &mut self.runtime);
         self.finish("announce", announced, now);
     }
 
     /// Records an admitted node's statement about itself.
-    pub(crate) fn note_met(&mut self, peer: &NodeId) {
+    pub(crate) fn record_member(&mut self, peer: &NodeId) {
         if let Some(lives) = &mut self.lives {
             let life = lives.entry(peer.name.clone()).or_default();
             *life = peer.life.max(*life);
@@ -315,11 +315,11 @@ impl Swim {
             }));
         }
         while let Some(notification) = self.runtime.to_notify() {
-            self.take(notification, now);
+            self.on_notification(notification, now);
         }
     }
 
-    fn take(&mut self, notification: OwnedNotification<NodeId>, now: Timestamp) {
+    fn on_notification(&mut self, notification: OwnedNotification<NodeId>, now: Timestamp) {
         match notification {
             OwnedNotification::MemberUp(id) => {
                 self.alive.insert(id.name.clone(), id.clone());

@@ -11,7 +11,7 @@ pub(crate) struct Hearing {
 
 impl Hearing {
     /// Records a received packet; returns true if the broker counted as stalled.
-    pub(crate) fn note(&self) -> bool {
+    pub(crate) fn record(&self) -> bool {
         self.packets.fetch_add(1, Ordering::AcqRel);
         self.is_missed.load(Ordering::Acquire) && self.is_missed.swap(false, Ordering::AcqRel)
     }
@@ -33,9 +33,9 @@ mod tests {
     #[test]
     fn stall_end_is_reported_once() {
         let hearing = Hearing::default();
-        assert!(!hearing.note());
+        assert!(!hearing.record());
         hearing.miss();
-        assert!(hearing.note() && !hearing.note());
+        assert!(hearing.record() && !hearing.record());
         assert_eq!(hearing.packets(), 3);
     }
 }

@@ -133,7 +133,7 @@ impl Link {
     /// Records a message whose echo is expected, even if there was no room to send it; true if the
     /// broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
-        let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
+        let is_stalled = self.echo.record_sent(self.hearing.packets(), now);
         if is_stalled {
             self.hearing.miss();
         }
@@ -207,7 +207,7 @@ impl LinkTask {
                 Some(_) => {}
                 None => self.has_reported_clock = false,
             }
-            self.note_unreachable(&error);
+            self.record_unreachable(&error);
             if let Some(reason) = error.rejection() {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
@@ -278,7 +278,7 @@ impl LinkTask {
             .inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         let node = identity.and_then(|identity| identity.node());
-        self.hearing.note();
+        self.hearing.record();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
         counters
             .troubles()
@@ -309,7 +309,7 @@ impl LinkTask {
                 continue;
             }
             silent = Duration::ZERO;
-            if self.hearing.note() {
+            if self.hearing.record() {
                 self.tell(LinkChange::Answered);
             }
             match packet {
@@ -357,7 +357,7 @@ impl LinkTask {
 
     /// Records that the configured broker is unreachable. Other brokers come and go with their
     /// nodes, which the election tracks.
-    fn note_unreachable(&self, error: &ConnectionError) {
+    fn record_unreachable(&self, error: &ConnectionError) {
         let is_expected = self.setup.config.broker.as_ref() == Some(&self.broker);
         if is_expected
             && error.rejection().is_none()
@@ -365,7 +365,7 @@ impl LinkTask {
         {
             let broker = self.broker.to_string();
             let troubles = self.setup.counters.troubles();
-            troubles.note_about(
+            troubles.record_about(
                 &broker,
                 self.setup.unreachable,
                 &format!("broker not reached: {error}"),
@@ -380,7 +380,7 @@ impl LinkTask {
         self.setup
             .counters
             .troubles()
-            .note_about(&broker, TroubleKind::BrokerRefuses, &cause);
+            .record_about(&broker, TroubleKind::BrokerRefuses, &cause);
         if self.reported_refusal.as_ref() != Some(&refusal) {
             self.setup.counters.count(Event::BrokerRefused);
             self.reported_refusal = Some(refusal);

@@ -74,7 +74,7 @@ fn login() -> Vec<u8> {
 }
 
 /// Receives until the bytes have this text.
-async fn hear(socket: &mut Socket, wanted: &[u8]) -> Vec<u8> {
+async fn receive(socket: &mut Socket, wanted: &[u8]) -> Vec<u8> {
     let mut heard = Vec::new();
     let hearing = async {
         while !heard.windows(wanted.len()).any(|part| part == wanted) {
@@ -109,10 +109,10 @@ async fn page_works_like_any_program() {
     for part in login().chunks(5) {
         page.send(Message::binary(part.to_vec())).await.unwrap();
     }
-    hear(&mut page, &[0x20, 2, 0, 0]).await;
+    receive(&mut page, &[0x20, 2, 0, 0]).await;
     let subscription = packet(0x82, &[0, 1], "ecod/v1/lot/global_detections", &[0]);
     page.send(Message::binary(subscription)).await.unwrap();
-    hear(&mut page, b"ecod/v1/lot/global_detections").await;
+    receive(&mut page, b"ecod/v1/lot/global_detections").await;
     let report = br#"{"schema":1,"node":"edge--page","seq":1,"captured_at_us":NOW,"objects":[{"label":"car","confidence":0.9,"x_m":3.1,"y_m":0}]}"#;
     let topic = "ecod/v1/lot/detections/edge--page";
     for seq in 1.. {
@@ -136,7 +136,7 @@ async fn page_works_like_any_program() {
         }
         assert!(seq < 400, "the report never came to the map");
     }
-    hear(&mut page, br#""contributors":["edge"]"#).await;
+    receive(&mut page, br#""contributors":["edge"]"#).await;
     // The rights are equal, too.
     page.send(Message::binary(packet(
         0x30,
@@ -219,7 +219,7 @@ async fn non_mqtt_messages_end_connection() {
     let ends = |messages: Vec<Message>| async move {
         let mut page = page(door).await;
         page.send(Message::binary(login())).await.unwrap();
-        hear(&mut page, &[0x20, 2, 0, 0]).await;
+        receive(&mut page, &[0x20, 2, 0, 0]).await;
         for message in messages {
             if page.send(message).await.is_err() {
                 return;
@@ -236,6 +236,6 @@ async fn non_mqtt_messages_end_connection() {
     ends([vec![part(Data::Binary)], vec![part(Data::Continue); 30_000]].concat()).await;
     let mut honest = page(door).await;
     honest.send(Message::binary(login())).await.unwrap();
-    hear(&mut honest, &[0x20, 2, 0, 0]).await;
+    receive(&mut honest, &[0x20, 2, 0, 0]).await;
     cell.stop().await;
 }

@@ -36,7 +36,7 @@ fn claimants_counts_are_forgotten() {
         );
         sent.extend(euclid.wait_until(60_000));
         sent.extend(euclid.resync.snapshot(&euclid.ledger));
-        edge.hear(&sent);
+        edge.receive(&sent);
         assert_eq!(
             (edge.incorrect("gauss"), euclid.incorrect("gauss")),
             (0, 0),
@@ -50,7 +50,7 @@ fn claimants_counts_are_forgotten() {
 #[test]
 fn claimant_extends_no_earlier_leadership() {
     let mut euclid = signing("euclid", 5, "gauss");
-    euclid.hear(&sign(vec![share(
+    euclid.receive(&sign(vec![share(
         "gauss",
         Some(5),
         vec![slander(5, "gauss", 3)],
@@ -87,8 +87,8 @@ fn short_leadership_counts_after_handover() {
     let mut gauss = signing("gauss", 8, "gauss");
     gauss.lead(8);
     let said = sign(gauss.record(8, "euclid"));
-    edge.hear(&said);
-    hopper.hear(&said);
+    edge.receive(&said);
+    hopper.receive(&said);
     edge.wait_until(4000);
     hopper.wait_until(4000);
     gauss.resync.step_down();

@@ -521,7 +521,7 @@ fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
         let (mut detection, _) = street.next(mounted, 1.0, 10.0);
         detection.bounding_box.y_max += 2.0 * street.normal();
         let boxes = [(&detection, projection.cut(&detection))];
-        told = check.take(
+        told = check.add(
             boxes,
             Timestamp::default() + Duration::from_millis(500 * half_seconds),
             &projection,
@@ -567,7 +567,7 @@ fn turned_camera_is_detected_in_crowd() {
         let boxes = crowd
             .iter()
             .map(|detection| (detection, projection.cut(detection)));
-        told = check.take(
+        told = check.add(
             boxes,
             Timestamp::default() + Duration::from_millis(500 * half_seconds),
             &projection,
@@ -596,7 +596,7 @@ fn hanging_objects_indicate_no_turn() {
     for seconds in 0..60u32 {
         let at = Point2::new(16.0 + f64::from(seconds % 8), 1.0);
         let hanging = seen("traffic light", &lamp, at, 0.0, &above).unwrap();
-        let told = check.take(
+        let told = check.add(
             [(&hanging, Cut::default())],
             Timestamp::default() + Duration::from_secs(seconds.into()),
             &projection,
@@ -618,7 +618,7 @@ fn raised_objects_indicate_no_turn() {
         ..detection_of("person")
     };
     for seconds in 0..60u32 {
-        let told = check.take(
+        let told = check.add(
             [(&hanging, Cut::default())],
             Timestamp::default() + Duration::from_secs(seconds.into()),
             &projection,

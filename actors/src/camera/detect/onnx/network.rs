@@ -100,7 +100,7 @@ impl Network {
             }
             (taken, told) => {
                 let said = || {
-                    said_size(&model).ok_or_else(|| OnnxError::AnySize {
+                    stated_size(&model).ok_or_else(|| OnnxError::AnySize {
                         path: path.to_owned(),
                     })
                 };
@@ -210,7 +210,7 @@ fn output(name: String, value: &Value) -> NamedTensor {
 }
 
 /// The size that the exporter wrote: `imgsz` of Ultralytics, `[height, width]`.
-fn said_size(model: &Model) -> Option<ImageSize> {
+fn stated_size(model: &Model) -> Option<ImageSize> {
     let said: Vec<u32> = serde_json::from_str(model.metadata().get("imgsz")?).ok()?;
     match said[..] {
         [height, width] => Some(ImageSize { width, height }),

@@ -238,8 +238,8 @@ impl SceneStyle {
             let entity = SceneEntity::new(map.fused_at_us, format!("landmark/{}", landmark.id))
                 .ball(pose, self.object_m, color)
                 .text(pose, TEXT * self.object_m, text, 1.0)
-                .note("confidence", landmark.confidence.to_string())
-                .note("contributors", listed(&landmark.contributors));
+                .metadata("confidence", landmark.confidence.to_string())
+                .metadata("contributors", listed(&landmark.contributors));
             match self.facing_rad.get(&landmark.id) {
                 Some(facing) => entity.arrow(
                     plane_pose(landmark.x_m, landmark.y_m, *facing),
@@ -275,8 +275,8 @@ impl SceneStyle {
                     object.label.to_string(),
                     existence.max(MIN_TEXT_OPACITY),
                 )
-                .note("confidence", object.confidence.to_string())
-                .note("contributors", listed(&object.contributors))
+                .metadata("confidence", object.confidence.to_string())
+                .metadata("contributors", listed(&object.contributors))
         });
         SceneUpdate::new(map.fused_at_us, landmarks.chain(objects))
     }
@@ -293,7 +293,7 @@ impl SceneStyle {
                     DETECTED * self.object_m,
                     DETECTED_COLOR,
                 )
-                .note("label", object.label.to_string());
+                .metadata("label", object.label.to_string());
             match object.covariance() {
                 Some(covariance) => {
                     entity.ellipse([object.x_m, object.y_m], &covariance, DETECTED_COLOR)
@@ -481,7 +481,7 @@ impl SceneEntity {
         self
     }
 
-    fn note(mut self, key: &'static str, value: String) -> Self {
+    fn metadata(mut self, key: &'static str, value: String) -> Self {
         self.metadata.push(KeyValue { key, value });
         self
     }

@@ -129,7 +129,7 @@ impl Door {
     }
 
     /// Processes a program's message.
-    pub(in crate::transport::broker) fn take(
+    pub(in crate::transport::broker) fn on_publish(
         &self,
         principal: &Principal,
         place: TopicPlace,
@@ -140,24 +140,24 @@ impl Door {
             return Ok(());
         };
         match place {
-            TopicPlace::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
+            TopicPlace::Cell if publish.retain => door.on_nodeless_message(topic, &publish.payload),
             TopicPlace::Cell => Ok(()),
             TopicPlace::Door => door.may_say(principal, topic),
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
-                Some(Topic::Cell) => door.take_description(principal, &publish.payload),
-                Some(Topic::Nodes(name)) => door.take_dismissal(principal, name),
+                Some(Topic::Cell) => door.on_description(principal, &publish.payload),
+                Some(Topic::Nodes(name)) => door.on_dismissal(principal, name),
                 Some(Topic::Boxes(name)) => {
                     let route = door.route(principal, &name)?;
-                    self.take_boxes(&name, route, &publish.payload)
+                    self.on_boxes(&name, route, &publish.payload)
                 }
-                _ => door.take_report(principal, topic, &publish.payload),
+                _ => door.on_report(principal, topic, &publish.payload),
             },
         }
     }
 
     /// Projects a program's boxes, and passes the resulting reports to the cell. Boxes without a
     /// position are left out and counted.
-    pub(in crate::transport::broker) fn take_boxes(
+    pub(in crate::transport::broker) fn on_boxes(
         &self,
         name: &NodeName,
         route: BoxRoute,
@@ -186,7 +186,7 @@ impl Door {
         for unplaced in unplaced {
             let text = format!("not on the map, {unplaced}");
             let refusal = DoorRefusal::new(RefusalReason::Rejected(RejectReason::NotPlaced), text);
-            self.note_refusal(name.as_str(), &setup.topics.path(&topic), &refusal);
+            self.record_refusal(name.as_str(), &setup.topics.path(&topic), &refusal);
         }
         if (setup.fuses)(ReportKind::VoteDetections) {
             let votes = report.votes();
@@ -201,7 +201,7 @@ impl Door {
     }
 
     /// Counts and shows a refusal.
-    pub(in crate::transport::broker) fn note_refusal(
+    pub(in crate::transport::broker) fn record_refusal(
         &self,
         client_id: &str,
         topic: &str,
@@ -229,7 +229,7 @@ impl Door {
             text = refusal.text,
             "program's message refused"
         );
-        let status = lock(&door.refusals).note(&setup.node, client, topic, refusal, clock::now());
+        let status = lock(&door.refusals).record(&setup.node, client, topic, refusal, clock::now());
         if let Some(status) = status {
             let topic = setup.topics.clients(&setup.node);
             door.retain(Publication {
@@ -296,7 +296,7 @@ impl DoorState {
         }
     }
 
-    fn take_report(
+    fn on_report(
         &self,
         principal: &Principal,
         topic: &str,
@@ -435,7 +435,7 @@ impl DoorState {
 
     /// Limits the number of vehicles without a node whose statuses are retained; an empty status
     /// removes a vehicle.
-    fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
+    fn on_nodeless_message(&self, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
         let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else {
             return Ok(());
         };
@@ -454,7 +454,7 @@ impl DoorState {
     }
 
     /// Processes the cell's description from a program that may act as the node.
-    fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), DoorRefusal> {
+    fn on_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), DoorRefusal> {
         let DoorSetup { node, limits, .. } = &self.setup;
         if !principal.is_of(node) {
             let text = format!(
@@ -477,7 +477,7 @@ impl DoorState {
     }
 
     /// Dismisses a missing node at the request of a program that may act as the node.
-    fn take_dismissal(&self, principal: &Principal, name: NodeName) -> Result<(), DoorRefusal> {
+    fn on_dismissal(&self, principal: &Principal, name: NodeName) -> Result<(), DoorRefusal> {
         let DoorSetup { node, dismiss, .. } = &self.setup;
         if !principal.is_of(node) {
             let text = format!(
@@ -587,10 +587,12 @@ impl Handler for DoorHooks {
                 moved.topic = place.topic(&publish.topic).into();
                 // rmqtt calls `Permissions` for a published message, but not for a last will.
                 if let FromType::LastWill = from.typ()
-                    && let Err(refusal) = self.door.take(&principal, place, &publish.topic, publish)
+                    && let Err(refusal) =
+                        self.door
+                            .on_publish(&principal, place, &publish.topic, publish)
                 {
                     let client = &session.id.client_id;
-                    self.door.note_refusal(client, &publish.topic, &refusal);
+                    self.door.record_refusal(client, &publish.topic, &refusal);
                     moved.topic = TopicPlace::Inbound.topic(&publish.topic).into();
                     moved.retain = false;
                 }

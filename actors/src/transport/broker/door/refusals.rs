@@ -84,7 +84,7 @@ const SHOW_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Refusals {
     /// Records a refusal; returns the status if it must be published now.
-    pub(super) fn note(
+    pub(super) fn record(
         &mut self,
         node: &NodeName,
         client: &str,
@@ -148,7 +148,7 @@ mod tests {
     fn shown(refusals: &mut Refusals, client: &str, at_s: u64) -> Option<Vec<String>> {
         let node = NodeName::from_static("euclid");
         let refusal = DoorRefusal::not_permitted("no");
-        let status = refusals.note(
+        let status = refusals.record(
             &node,
             client,
             "detections/gauss",

@@ -153,13 +153,13 @@ impl Sessions {
                     });
                 }
                 let attestation = decode(attestation)?;
-                self.take_proof(head, signed, &attestation, introduction, &cookie, arrival)
+                self.on_proof(head, signed, &attestation, introduction, &cookie, arrival)
             }
             Handshake::Accept { echo, introduction } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 let admission = if self.prove_certificates() {
                     let attestation = decode(attestation)?;
-                    self.take_accept(head, signed, &attestation, &introduction, arrival)?
+                    self.on_accept(head, signed, &attestation, &introduction, arrival)?
                 } else {
                     Admission {
                         proven: None,
@@ -232,7 +232,7 @@ impl Sessions {
 
     /// Verifies a proof, and accepts it with this node's own. `message` is the encoded proof, to
     /// which the attestation belongs.
-    fn take_proof(
+    fn on_proof(
         &mut self,
         head: &FrameHeader,
         message: &[u8],
@@ -330,7 +330,7 @@ impl Sessions {
 
     /// Verifies the accept of a proof that this node sent. `message` is the encoded accept, to
     /// which the attestation belongs.
-    fn take_accept(
+    fn on_accept(
         &mut self,
         head: &FrameHeader,
         message: &[u8],
@@ -439,7 +439,7 @@ impl Sessions {
                 peer.id = id.clone();
                 peer.proven = proven;
             }
-            peer.note_heard(now);
+            peer.record_received(now);
             if is_proof {
                 peer.proof_counter = head.counter;
             }

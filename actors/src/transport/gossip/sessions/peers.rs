@@ -59,7 +59,7 @@ impl PeerSession {
         TokenBucket::new(FRAMES, FRAME_INTERVAL, now)
     }
 
-    pub(super) fn note_heard(&mut self, now: Timestamp) {
+    pub(super) fn record_received(&mut self, now: Timestamp) {
         self.heard = now;
         self.unheard_since = None;
     }
@@ -104,7 +104,7 @@ impl PeerTable {
     /// Processes the counter of a handshake's frame in a cell without certificates. It may be far
     /// ahead, because the handshake itself proves that it is fresh. A session that is active at one
     /// address cannot be taken over from another.
-    pub(super) fn take_counter(
+    pub(super) fn accept_counter(
         &mut self,
         head: &FrameHeader,
         from: SocketAddr,
@@ -116,10 +116,10 @@ impl PeerTable {
         if peer.address != from && now.since(peer.heard) < HEARD_TIME {
             return Err(FrameEvent::Replayed);
         }
-        match peer.keys.take(head.counter) {
+        match peer.keys.accept(head.counter) {
             Err(FrameEvent::Replayed) => Err(FrameEvent::Replayed),
             _ => {
-                peer.note_heard(now);
+                peer.record_received(now);
                 Ok(())
             }
         }

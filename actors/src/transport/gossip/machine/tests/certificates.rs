@@ -3,19 +3,19 @@
 use rustls::pki_types::UnixTime;
 
 use super::*;
-use crate::transport::gossip::trial_authority::TrialAuthority;
+use crate::transport::gossip::test_authority::TestAuthority;
 
 /// A cell with certificates, and its CA.
 struct CertifiedCell {
     cell: Cell,
-    authority: TrialAuthority,
+    authority: TestAuthority,
 }
 
 impl CertifiedCell {
     fn new(multicast: bool) -> Self {
         Self {
             cell: Cell::new(multicast),
-            authority: TrialAuthority::new(),
+            authority: TestAuthority::new(),
         }
     }
 
@@ -104,7 +104,7 @@ fn key_alone_admits_no_node() {
     let now = certified.cell.now.micros();
     certified.cell.forget_events();
     certified.cell.start(4, "node-4");
-    let strange = TrialAuthority::new().identity("node-5", Role::Auto);
+    let strange = TestAuthority::new().identity("node-5", Role::Auto);
     certified
         .cell
         .start_as(5, "node-5", (KEY, Some(strange)), now);
@@ -134,7 +134,7 @@ fn revoked_node_needs_new_certificate() {
     certified.authority.revoke(&node_name(4));
     for node in 1..=3 {
         let files = certified.authority.files(&node_name(node));
-        certified.set_identity(node, TrialAuthority::read(&files, &name(node)));
+        certified.set_identity(node, TestAuthority::read(&files, &name(node)));
         let gone = [
             MembershipEvent::Expelled { name: node_name(4) },
             MembershipEvent::Down { name: node_name(4) },

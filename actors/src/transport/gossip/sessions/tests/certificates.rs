@@ -5,7 +5,7 @@ use rustls::pki_types::UnixTime;
 
 use super::*;
 use crate::transport::gossip::handshake::{Attestation, Side, SignedMessage};
-use crate::transport::gossip::trial_authority::TrialAuthority;
+use crate::transport::gossip::test_authority::TestAuthority;
 
 /// Time after which a session is answered again.
 const SLOW: Duration = Duration::from_millis(250);
@@ -14,12 +14,12 @@ fn cell_key() -> CellKey {
     CellKey::new(&"07".repeat(32), &NodeName::from_static("lot-1"))
 }
 
-fn node(authority: &mut TrialAuthority, name: &'static str, session: u8) -> End {
+fn node(authority: &mut TestAuthority, name: &'static str, session: u8) -> End {
     End::with(name, session, Some(authority.identity(name, Role::Auto)))
 }
 
-fn two() -> (TrialAuthority, End, End) {
-    let mut authority = TrialAuthority::new();
+fn two() -> (TestAuthority, End, End) {
+    let mut authority = TestAuthority::new();
     let a = node(&mut authority, "a", 1);
     let b = node(&mut authority, "b", 2);
     (authority, a, b)
@@ -86,7 +86,7 @@ fn certified_nodes_exchange_rights() {
 
 #[test]
 fn longest_frame_fits_datagram() {
-    let mut authority = TrialAuthority::new();
+    let mut authority = TestAuthority::new();
     let names: [&'static str; 2] = ["a", "b"].map(|letter| &*letter.repeat(64).leak());
     let [mut a, mut b] = [(names[0], 1), (names[1], 2)].map(|(name, session)| {
         let mut end = node(&mut authority, name, session);
@@ -158,7 +158,7 @@ fn node_without_certificate_is_refused() {
 #[test]
 fn foreign_certificate_is_refused() {
     let (mut authority, mut a, mut b) = two();
-    let mut strange = node(&mut TrialAuthority::new(), "euclid", 3);
+    let mut strange = node(&mut TestAuthority::new(), "euclid", 3);
     let forged = proof(&mut strange, &mut b);
     assert_eq!(
         b.open(&forged, strange.address, NOW + SLOW),
@@ -190,7 +190,7 @@ fn revoked_certificate_ends_session() {
     introduce(&mut a, &mut b);
     authority.revoke(&a.id.name);
     let files = authority.files(&b.id.name);
-    let (expelled, greeted) = b.sessions.set_identity(TrialAuthority::read(&files, "b"));
+    let (expelled, greeted) = b.sessions.set_identity(TestAuthority::read(&files, "b"));
     assert_eq!((expelled, greeted), (vec![a.id.name.clone()], Vec::new()));
     let frame = a.seal(&b.id.name, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::BadSeal));
@@ -204,9 +204,9 @@ fn revoked_certificate_ends_session() {
 
 #[test]
 fn expired_certificate_ends_session() {
-    let mut authority = TrialAuthority::new();
+    let mut authority = TestAuthority::new();
     let files = authority.issue("a", Role::Auto, Duration::from_secs(60));
-    let mut a = End::with("a", 1, Some(TrialAuthority::read(&files, "a")));
+    let mut a = End::with("a", 1, Some(TestAuthority::read(&files, "a")));
     let mut b = node(&mut authority, "b", 2);
     introduce(&mut a, &mut b);
     let Some(prover) = &b.sessions.prover else {
@@ -310,14 +310,14 @@ fn swapped_handshake_parts_are_refused() {
 /// The holder of one certificate invents any number of observers.
 #[test]
 fn one_certificate_cannot_fill_table() {
-    let mut authority = TrialAuthority::new();
+    let mut authority = TestAuthority::new();
     let mut b = node(&mut authority, "b", 200);
     b.sessions.peers = PeerTable::new(256);
     let files = authority.issue("gauss", Role::Cav, Duration::from_secs(60));
     let mut refused = 0;
     for n in 0..40 {
         let name: &'static str = format!("gauss--{n}").leak();
-        let mut observer = End::with(name, n, Some(TrialAuthority::read(&files, name)));
+        let mut observer = End::with(name, n, Some(TestAuthority::read(&files, name)));
         let proof = proof(&mut observer, &mut b);
         let opened = b.open(&proof, observer.address, NOW + SLOW);
         refused += usize::from(opened == Err(FrameEvent::TooManyPeers));
@@ -408,7 +408,7 @@ fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
 
 #[test]
 fn forged_challenges_delay_no_session() {
-    let mut authority = TrialAuthority::new();
+    let mut authority = TestAuthority::new();
     let [mut a, mut b, mut c] =
         [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
     introduce(&mut a, &mut b);

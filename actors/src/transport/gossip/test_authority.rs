@@ -13,12 +13,12 @@ use super::handshake::Identity;
 use crate::transport::pki::{Authority, Credentials, TlsConfig};
 
 /// The CA; its directory is removed with it.
-pub(crate) struct TrialAuthority {
+pub(crate) struct TestAuthority {
     directory: PathBuf,
     pub(crate) authority: Authority,
 }
 
-impl TrialAuthority {
+impl TestAuthority {
     #[expect(clippy::expect_used, reason = "a test ends without its directory")]
     pub(crate) fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
@@ -88,7 +88,7 @@ impl TrialAuthority {
     }
 }
 
-impl Drop for TrialAuthority {
+impl Drop for TestAuthority {
     fn drop(&mut self) {
         // A directory that cannot be removed does not fail a test.
         let _ = std::fs::remove_dir_all(&self.directory);
