@@ -247,13 +247,13 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
+    let find = |who: &Who| match who {
+        Who::Edge => Ok(EDGE),
+        Who::Leader => cell.leader(),
+        Who::Standby => cell.standby(),
+    };
     match fault {
         Fault::Kill(victims) => {
-            let find = |who: &Who| match who {
-                Who::Edge => Ok(EDGE),
-                Who::Leader => cell.leader(),
-                Who::Standby => cell.standby(),
-            };
             let victims = victims
                 .iter()
                 .map(find)
@@ -268,6 +268,7 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
         Fault::FloodStandby => cell.flood(cell.standby()?),
         Fault::Split => cell.split(true),
         Fault::CutOneWay => cell.cut_one_way(true),
+        Fault::Readdress(who) => cell.readdress(find(&who)?),
         Fault::Lose(percent) => cell.lose(percent),
         Fault::Heal(Cure::Split) => cell.split(false),
         Fault::Heal(Cure::OneWay) => cell.cut_one_way(false),

@@ -183,7 +183,7 @@ impl Cell {
         for node in self.nodes.iter_mut().filter(|node| node.process.is_some()) {
             let log = node.door_log();
             node.door = Some(doors::open(
-                node.address.broker,
+                (Ipv4Addr::LOCALHOST, node.address.broker.port()).into(),
                 node.namespace.as_deref(),
                 &log,
             )?);
@@ -348,6 +348,11 @@ impl Cell {
             .context("the cell has no nodes")?;
         self.unreached = cut.then_some(last);
         self.bridged()?.cut_one_way(EDGE, last, cut)
+    }
+
+    /// Gives a node another address.
+    pub(crate) fn readdress(&mut self, node: usize) -> anyhow::Result<()> {
+        self.bridged()?.readdress(node)
     }
 
     /// So many percent of all packets are lost from now on.

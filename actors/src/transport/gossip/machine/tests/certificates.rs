@@ -62,6 +62,11 @@ fn nodes_with_certificates_find_each_other() {
 }
 
 #[test]
+fn a_node_with_a_certificate_that_gets_another_address_is_reached_there_at_once() {
+    a_node_moves(CertifiedCell::of(3).cell);
+}
+
+#[test]
 fn a_second_node_with_a_certificate_whose_only_seed_is_the_first_gives_up() {
     let mut certified = CertifiedCell::new(false);
     certified.start(1);
