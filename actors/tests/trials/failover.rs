@@ -277,14 +277,11 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
 }
 
 fn phase(step: &Step, from: ecod::model::time::Timestamp, cell: &Cell) -> Phase {
-    let mut measured = if step.measured {
+    let measured = if step.measured {
         cell.vehicles()
     } else {
         Default::default()
     };
-    if let Some(unreached) = cell.unreached() {
-        measured.remove(unreached);
-    }
     let changes = step.changes.0..=step.changes.1;
     Phase {
         from,

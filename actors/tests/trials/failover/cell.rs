@@ -340,7 +340,7 @@ impl Cell {
         self.bridged()?.split(&self.apart)
     }
 
-    /// The leader's packets do not reach the last vehicle that may lead, or do again.
+    /// The leader's packets do not reach the last vehicle that may lead, or do again. The standby's broker relays the maps.
     pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
         let nodes = self.nodes.len();
         let last = (0..nodes)
@@ -419,11 +419,6 @@ impl Cell {
             .skip(1)
             .filter(|node| node.process.is_some());
         vehicles.map(|node| node.name.clone()).collect()
-    }
-
-    /// The vehicle that the leader does not reach, if there is one.
-    pub(crate) fn unreached(&self) -> Option<&NodeName> {
-        self.unreached.map(|node| &self.nodes[node].name)
     }
 
     /// Where the nodes' brokers listen.

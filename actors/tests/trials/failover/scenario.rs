@@ -227,6 +227,7 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
             measured(Fault::CutOneWay, 6, (0, 2)),
             step(Fault::Heal(Cure::OneWay), 10, (0, 2)),
         ],
+        gap: GapBar::Silent,
         ..BASE
     },
     Scenario {
