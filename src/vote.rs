@@ -14,6 +14,7 @@
 //! A report is rejected if neither its `seq` nor its capture time is newer than the last of its
 //! vehicle, unless the vehicle's clock was set back.
 
+mod arrivals;
 mod calibration;
 mod config;
 mod configured_method;
@@ -32,7 +33,7 @@ mod visibility;
 mod weighted;
 
 use std::collections::btree_map::Entry;
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use nalgebra::Point2;
@@ -50,6 +51,7 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::wire::{
     LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict,
 };
+use arrivals::Arrivals;
 use configured_method::ConfiguredMethod;
 use method::NewVote;
 
@@ -110,8 +112,8 @@ pub struct Vote {
     open: bool,
     /// `None` for a landmark of an open cell.
     landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
-    /// Landmarks of an open cell, oldest first.
-    arrivals: VecDeque<LandmarkId>,
+    /// Landmarks of an open cell.
+    arrivals: Arrivals,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
     /// Vacancy signs that were recently read, with the time, by vehicle.
@@ -134,7 +136,7 @@ impl Vote {
                 .into_iter()
                 .map(|l| (l.id.clone(), Some(Box::new(l))))
                 .collect(),
-            arrivals: VecDeque::new(),
+            arrivals: Arrivals::default(),
             last_reports: BTreeMap::new(),
             method,
             signs: BTreeMap::new(),
@@ -160,8 +162,9 @@ impl Vote {
             .map(|l| (l.id.clone(), Some(Box::new(l))))
             .collect();
         if is_open {
-            self.arrivals
-                .extend(self.landmarks.keys().filter(|_| !self.open).cloned());
+            for id in self.landmarks.keys().filter(|_| !self.open) {
+                self.arrivals.add(id, None, usize::MAX);
+            }
             known.extend(self.landmarks.into_keys().map(|id| (id, None)));
         } else {
             self.arrivals.clear();
@@ -359,7 +362,7 @@ impl Vote {
         };
         self.ignored += forgotten as u64;
         if !self.landmarks.contains_key(id) {
-            self.open_landmark(id);
+            self.open_landmark(id, &report.node);
         }
         self.method.get_mut().add_vote(&vote);
         true
@@ -433,14 +436,12 @@ impl Vote {
         sorted.collect()
     }
 
-    fn open_landmark(&mut self, landmark: &LandmarkId) {
-        if self.arrivals.len() >= self.config.max_landmarks
-            && let Some(oldest) = self.arrivals.pop_front()
-        {
-            self.landmarks.remove(&oldest);
-            self.method.get_mut().remove_landmark(&oldest);
+    fn open_landmark(&mut self, landmark: &LandmarkId, vehicle: &NodeName) {
+        let max = self.config.max_landmarks;
+        if let Some(dropped) = self.arrivals.add(landmark, Some(vehicle), max) {
+            self.landmarks.remove(&dropped);
+            self.method.get_mut().remove_landmark(&dropped);
         }
-        self.arrivals.push_back(landmark.clone());
         self.landmarks.insert(landmark.clone(), None);
     }
 

@@ -32,7 +32,8 @@ pub struct VoteConfig {
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Maximum number of landmarks; beyond it an open cell drops the oldest landmark. Default 1024.
+    /// Maximum number of landmarks; beyond it an open cell drops the oldest landmark of the vehicle
+    /// that named most. Default 1024.
     /// Bounds memory.
     pub max_landmarks: usize,
     /// Maximum number of vehicles. Beyond it vehicles that have been silent for long are dropped;

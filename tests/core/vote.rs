@@ -295,6 +295,24 @@ fn excess_vehicles_are_ignored() {
 }
 
 #[test]
+fn invented_locations_displace_no_votes() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    for seq in 1..50 {
+        let at = START + Duration::from_millis(100 * seq);
+        let names: Vec<_> = (0..1000).map(|place| format!("{seq}-{place}")).collect();
+        let invented: Vec<_> = names.iter().map(|name| (&**name, "cup", 0.9)).collect();
+        for node in ["a", "b"] {
+            vote.observe(&report(node, seq, at, &[("x", "vase", 0.9)]), at)
+                .unwrap();
+        }
+        vote.observe(&report("c", seq, at, &invented), at).unwrap();
+        let verdicts = vote.close(at).verdicts;
+        let honest = verdicts.iter().find(|verdict| verdict.landmark == "x");
+        assert_eq!(honest.unwrap().contributors.len(), 2, "in round {seq}");
+    }
+}
+
+#[test]
 fn adopted_ledger_restores_class_trust() {
     let mut ledger = ReputationLedger::default();
     for n in 0..200 {

@@ -19,6 +19,7 @@
 //!   will.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -122,6 +123,7 @@ impl Actor for Gateway {
         let inbox = Arc::clone(&state.inbox);
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
+            GatewayMessage::Reconnect => state.reconnect(&myself),
             GatewayMessage::SetReportBrokers { addresses } => {
                 state.report_brokers = Some(addresses);
             }
@@ -301,12 +303,33 @@ impl GatewayState {
             tokio::spawn(link.leave(LEAVE_TIMEOUT));
         }
         for broker in wanted {
-            let id = LinkId(self.next_link);
-            self.next_link += 1;
-            self.links.insert(
-                id,
-                Link::spawn(id, broker, Arc::clone(&self.setup), events_to(myself)),
-            );
+            self.link_to(broker, myself);
+        }
+    }
+
+    fn link_to(&mut self, broker: BrokerAddress, myself: &ActorRef<GatewayMessage>) {
+        let id = LinkId(self.next_link);
+        self.next_link += 1;
+        self.links.insert(
+            id,
+            Link::spawn(id, broker, Arc::clone(&self.setup), events_to(myself)),
+        );
+    }
+
+    /// Replaces all links except those within this machine.
+    fn reconnect(&mut self, myself: &ActorRef<GatewayMessage>) {
+        let is_near = |broker: &BrokerAddress| {
+            let host = broker.host().trim_matches(['[', ']']).parse::<IpAddr>();
+            host.is_ok_and(|ip| ip.is_loopback() || ip.is_unspecified())
+        };
+        let dead: Vec<_> = self
+            .links
+            .extract_if(.., |_, link| !is_near(&link.broker))
+            .collect();
+        for (_, mut link) in dead {
+            link.state = LinkState::Down;
+            publish_state(&self.inbox, &link);
+            self.link_to(link.broker.clone(), myself);
         }
     }
 

@@ -32,7 +32,7 @@ use crate::transport::gossip::handshake::Identity;
 use crate::transport::gossip::key::{CellKey, SessionNonce};
 use crate::transport::gossip::machine::{GossipMachine, GossipOutput, GossipSetup};
 use crate::transport::gossip::node_id::NodeId;
-use crate::transport::gossip::socket::GossipSocket;
+use crate::transport::gossip::socket::{GossipSocket, is_of_this_machine, source_towards};
 use crate::transport::gossip::{
     EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig,
     MembershipEvent, MulticastConfig,
@@ -81,6 +81,9 @@ pub struct MembershipState {
     counters: Arc<FrameCounters>,
     certificates: Option<CertificateWatch>,
     renewals: Option<Renewals>,
+    /// True if the node's address belonged to this machine at the last check: behind address
+    /// translation it never does.
+    has_own_address: bool,
     name: NodeName,
     myself: ActorRef<MembershipMessage>,
     /// Tasks that end with the actor.
@@ -153,6 +156,9 @@ impl Actor for Membership {
         if let Some(credentials) = credentials {
             tasks.spawn(check_certificates(credentials, myself.clone()));
         }
+        if gossip.ip().is_unspecified() {
+            tasks.spawn(check_address(myself.clone()));
+        }
         if !join_group(&socket, &config.multicast) {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
         }
@@ -190,6 +196,7 @@ impl Actor for Membership {
             counters,
             certificates,
             renewals,
+            has_own_address: false,
             name: own_name,
             myself,
             _tasks: tasks,
@@ -236,6 +243,7 @@ impl Actor for Membership {
                 let step = renewals.and_then(|renewals| renewals.on_outcome(outcome));
                 state.on_renewal_step(step);
             }
+            MembershipMessage::CheckAddress => state.check_address(now),
             MembershipMessage::Wake => state.wake(),
         }
         state.carry_out();
@@ -258,6 +266,22 @@ impl MembershipState {
         }
         self.machine.tick(clock::now());
         self.handled.notify_one();
+    }
+
+    /// Moves when the node's address is no longer one of this machine, such as after a new lease
+    /// of a DHCP server.
+    fn check_address(&mut self, now: Timestamp) {
+        let own = self.machine.own_address().ip();
+        if is_of_this_machine(own) {
+            self.has_own_address = !own.is_unspecified();
+            return;
+        }
+        let members = self.machine.members().into_iter();
+        let source = members.map(|member| member.gossip).find_map(source_towards);
+        if let Some(ip) = source.filter(|_| self.has_own_address) {
+            tracing::info!(address = %ip, before = %own, "this node has another address");
+            self.machine.move_to(ip, now);
+        }
     }
 
     fn carry_out(&mut self) {
@@ -392,6 +416,15 @@ impl CertificateWatch {
 
 /// Time between two checks of the certificates against the clock.
 const CERTIFICATE_PERIOD: Duration = Duration::from_millis(500);
+
+/// Time between two checks of this node's address: about as long as a leader may be silent.
+const ADDRESS_PERIOD: Duration = Duration::from_millis(100);
+
+async fn check_address(membership: ActorRef<MembershipMessage>) {
+    while membership.cast(MembershipMessage::CheckAddress).is_ok() {
+        tokio::time::sleep(ADDRESS_PERIOD).await;
+    }
+}
 
 async fn check_certificates(
     credentials: Arc<Credentials>,

@@ -129,6 +129,11 @@ impl Actor for Uplink {
     ) -> Result<(), ActorProcessingErr> {
         match message {
             UplinkMessage::Look => state.look(&myself),
+            UplinkMessage::Reconnect => {
+                if let Some(link) = &mut state.link {
+                    link.reconnect(events_to(&myself));
+                }
+            }
             UplinkMessage::SetStatus { status } => {
                 state.setup.status = status;
                 state.publish_status();

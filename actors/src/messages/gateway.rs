@@ -18,6 +18,9 @@ pub enum GatewayMessage {
         /// The brokers, in no particular order.
         addresses: Vec<BrokerAddress>,
     },
+    /// Replace all connections to other machines: they are from an address that this machine no
+    /// longer has.
+    Reconnect,
     /// Subscribe to reports only on these brokers, for new connections. Before this message, a
     /// candidate subscribes on all brokers.
     SetReportBrokers {

@@ -45,6 +45,8 @@ pub enum MembershipMessage {
     /// Read changed certificates, and end sessions with an expired or revoked certificate; sent by
     /// the membership to itself.
     CheckCertificates,
+    /// Check whether this machine still has the node's address; sent by the membership to itself.
+    CheckAddress,
     /// A renewal of a certificate was decided; sent by the membership to itself.
     Renewal {
         /// The decision.

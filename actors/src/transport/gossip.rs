@@ -90,6 +90,8 @@ pub enum MembershipEvent {
         /// The node as it is now.
         member: Member,
     },
+    /// This node's own address changed; connections from the earlier address are dead.
+    Moved,
     /// A datagram arrived.
     Received {
         /// The authenticated sender.

@@ -247,13 +247,13 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
+    let find = |who: &Who| match who {
+        Who::Edge => Ok(EDGE),
+        Who::Leader => cell.leader(),
+        Who::Standby => cell.standby(),
+    };
     match fault {
         Fault::Kill(victims) => {
-            let find = |who: &Who| match who {
-                Who::Edge => Ok(EDGE),
-                Who::Leader => cell.leader(),
-                Who::Standby => cell.standby(),
-            };
             let victims = victims
                 .iter()
                 .map(find)
@@ -268,6 +268,7 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
         Fault::FloodStandby => cell.flood(cell.standby()?),
         Fault::Split => cell.split(true),
         Fault::CutOneWay => cell.cut_one_way(true),
+        Fault::Readdress(who) => cell.readdress(find(&who)?),
         Fault::Lose(percent) => cell.lose(percent),
         Fault::Heal(Cure::Split) => cell.split(false),
         Fault::Heal(Cure::OneWay) => cell.cut_one_way(false),
@@ -276,14 +277,11 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
 }
 
 fn phase(step: &Step, from: ecod::model::time::Timestamp, cell: &Cell) -> Phase {
-    let mut measured = if step.measured {
+    let measured = if step.measured {
         cell.vehicles()
     } else {
         Default::default()
     };
-    if let Some(unreached) = cell.unreached() {
-        measured.remove(unreached);
-    }
     let changes = step.changes.0..=step.changes.1;
     Phase {
         from,

@@ -108,6 +108,29 @@ impl Bridged {
         ip(&arguments)
     }
 
+    /// Gives a node another address, as a DHCP server may, and loses the one before.
+    pub(crate) fn readdress(&self, node: usize) -> anyhow::Result<()> {
+        let space = namespace(node);
+        let old = address(node);
+        let new = readdressed(node);
+        let change = |action: &str, address: Ipv4Addr| {
+            let address = format!("{address}/24");
+            ip(&["-n", &space, "address", action, &address, "dev", "eth0"])
+        };
+        change("delete", old)?;
+        change("add", new)?;
+        // Routes go with the last address of an interface.
+        ip(&[
+            "-n",
+            &space,
+            "route",
+            "replace",
+            "224.0.0.0/4",
+            "dev",
+            "eth0",
+        ])
+    }
+
     /// Every node loses this percentage of arriving packets; zero removes the loss.
     pub(crate) fn lose(&self, percent: u8) -> anyhow::Result<()> {
         let rules = if percent == 0 {
@@ -144,6 +167,11 @@ pub(crate) fn namespace(node: usize) -> String {
 /// Address of a node on the bridge.
 pub(crate) fn address(node: usize) -> Ipv4Addr {
     Ipv4Addr::new(10, 77, 0, node as u8 + 1)
+}
+
+/// Address of a node after [`Bridged::readdress`].
+fn readdressed(node: usize) -> Ipv4Addr {
+    Ipv4Addr::new(10, 77, 0, node as u8 + 101)
 }
 
 fn port(node: usize) -> String {

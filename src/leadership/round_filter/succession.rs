@@ -139,9 +139,7 @@ impl SuccessionFilter {
                 let standby = leadership.standby.as_ref().filter(|_| !is_staying);
                 self.admit_other(epoch, round, received_at, elected, standby)
             }
-            None if self.is_strange(epoch, leadership.term, received_at) => {
-                Err(Refusal::NotElected)
-            }
+            None if self.is_strange(epoch, leadership, received_at) => Err(Refusal::NotElected),
             None => self.admit_in_order(epoch, round, received_at, true),
         }
     }
@@ -149,14 +147,24 @@ impl SuccessionFilter {
     /// True if an unconfirmed epoch must not be accepted yet.
     ///
     /// The election receives terms only from nodes with the cell's key, at the latest with the next
-    /// leader's beats, and tracks terms that are over. Without election state, the filter accepts
-    /// the first publisher that keeps publishing for [`SUCCESSOR_CREDIT`].
-    fn is_strange(&mut self, epoch: &Epoch, known_term: u64, received_at: Timestamp) -> bool {
+    /// leader's beats, and tracks terms that are over. Without election state, or where this node
+    /// has followed or led a later epoch, the filter accepts the first publisher that keeps
+    /// publishing for [`SUCCESSOR_CREDIT`].
+    fn is_strange(
+        &mut self,
+        epoch: &Epoch,
+        leadership: &Leadership,
+        received_at: Timestamp,
+    ) -> bool {
         if self.is_retained {
             return false;
         }
-        let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
-        if vouched.contains(&epoch.term)
+        let terms = leadership.term..=leadership.term.saturating_add(TERMS_AHEAD);
+        let is_over = leadership
+            .epoch
+            .as_ref()
+            .is_some_and(|latest| latest > epoch);
+        if terms.contains(&epoch.term) && !is_over
             || self
                 .gate
                 .latest()
@@ -315,6 +323,27 @@ mod tests {
 
     fn at(ms: u64) -> Timestamp {
         Timestamp(ms * 1000)
+    }
+
+    /// A split heals after this node, which led its side, has been without a working part for
+    /// [`EPOCH_MEMORY`]: the other side's leader must first be elected, or go on alone for a while.
+    #[test]
+    fn own_earlier_leadership_needs_proof() {
+        let own = epoch(2, "gauss");
+        let other = epoch(2, "edge");
+        let seeking = Leadership {
+            position: Position::Seeking,
+            ..led_by(own.clone(), None)
+        };
+        let mut filter = SuccessionFilter::new(0);
+        let led = led_by(own.clone(), None);
+        assert_eq!(filter.admit(&own, 1, at(0), &led), Ok(()));
+        let quiet = EPOCH_MEMORY.as_millis() as u64;
+        let credit = SUCCESSOR_CREDIT.as_millis() as u64;
+        let mut admit = |round, ms| filter.admit(&other, round, at(ms), &seeking);
+        assert_eq!(admit(90, quiet), Err(Refusal::NotElected));
+        assert_eq!(admit(91, quiet + credit - 100), Err(Refusal::NotElected));
+        assert_eq!(admit(92, quiet + credit), Ok(()));
     }
 
     /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival

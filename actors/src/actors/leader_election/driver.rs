@@ -179,6 +179,11 @@ impl ElectionDriver {
             MembershipEvent::Troubled { about, kind, cause } => {
                 return self.counters.troubles().record_about(&about, kind, &cause);
             }
+            MembershipEvent::Moved => {
+                self.parts.gateway.send(GatewayMessage::Reconnect);
+                self.parts.uplink.send(UplinkMessage::Reconnect);
+                return;
+            }
             // The node ends with this error.
             MembershipEvent::Excluded => return,
         };

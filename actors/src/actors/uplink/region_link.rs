@@ -113,6 +113,12 @@ impl RegionLink {
         self.tile
     }
 
+    /// Replaces the connection. The last will of the earlier one comes before the new status.
+    pub(super) fn reconnect(&mut self, report: LinkSink) {
+        let broker = self.link.broker.clone();
+        self.link = Link::spawn(self.id, broker, Arc::clone(&self.setup), report);
+    }
+
     /// Processes an event of the link; returns true if the connection has just been established and
     /// has no published messages yet.
     pub(super) fn change(&mut self, change: LinkChange) -> bool {

@@ -89,6 +89,18 @@ pub(crate) enum Handshake {
     },
 }
 
+impl Handshake {
+    /// What the sender states about itself, except in a challenge.
+    pub(crate) fn introduction(&self) -> Option<&Introduction> {
+        match self {
+            Self::Challenge { .. } => None,
+            Self::Proof { introduction, .. } | Self::Accept { introduction, .. } => {
+                Some(introduction)
+            }
+        }
+    }
+}
+
 /// Information that two nodes exchange in the handshake.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Introduction {

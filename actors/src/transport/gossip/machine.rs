@@ -9,7 +9,7 @@
 //! waiting datagrams before it ticks; the time of the stall does not count.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -288,6 +288,23 @@ impl GossipMachine {
         self.flush_swim(at);
     }
 
+    /// This node's address as it states it; unspecified until it is discovered.
+    pub(crate) fn own_address(&self) -> SocketAddr {
+        self.gossip.own().gossip
+    }
+
+    /// Continues at another address of this machine, and greets all nodes from there.
+    pub(crate) fn move_to(&mut self, ip: IpAddr, now: Timestamp) {
+        let at = self.advance(now);
+        self.gossip.change(at, |own| own.gossip.set_ip(ip));
+        for address in self.sessions.addresses() {
+            self.send_hello(address, true, at);
+        }
+        self.outputs
+            .push_back(GossipOutput::Tell(MembershipEvent::Moved));
+        self.flush_swim(at);
+    }
+
     /// Spreads a true or false statement about a node.
     #[cfg(test)]
     pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
@@ -322,11 +339,19 @@ impl GossipMachine {
                 introduction,
                 answer,
                 speaks,
+                has_moved,
             } => {
                 let greeter = answer.is_none();
                 self.outputs
                     .extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
+                let name = introduction.id.name.clone();
                 self.meet(introduction, from, speaks, greeter, at);
+                let moved = self.gossip.alive().get(&name).filter(|_| has_moved);
+                if let Some(id) = moved {
+                    let member = self.member(id);
+                    let event = MembershipEvent::Changed { member };
+                    self.outputs.push_back(GossipOutput::Tell(event));
+                }
             }
             FrameContent::Gossip { from, body } => {
                 let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);

@@ -108,6 +108,8 @@ pub(crate) enum FrameContent {
         answer: Option<Vec<u8>>,
         /// True if its session is accepted for its name.
         speaks: bool,
+        /// True if its session was at another address before.
+        has_moved: bool,
     },
     /// A message of the SWIM protocol.
     Gossip { from: NodeName, body: Vec<u8> },
@@ -288,6 +290,11 @@ impl Sessions {
         (expelled, greeted)
     }
 
+    /// Addresses of all nodes.
+    pub(crate) fn addresses(&self) -> Vec<SocketAddr> {
+        self.peers.addresses()
+    }
+
     /// Removes all sessions, as if other sessions had replaced them.
     #[cfg(test)]
     pub(crate) fn forget_all(&mut self) {
@@ -330,10 +337,6 @@ impl Sessions {
                 let body = self
                     .unseal(&head, &self.own, frame)
                     .ok_or(FrameEvent::BadSeal)?;
-                if !self.prove_certificates() {
-                    self.peers
-                        .accept_counter(&head, arrival.from, arrival.now)?;
-                }
                 self.handle_handshake(&head, &body, arrival)
             }
             kind => self.open_body(&head, kind, frame, arrival.now),

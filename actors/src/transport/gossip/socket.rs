@@ -2,7 +2,7 @@
 //! share.
 
 use std::io::{self, ErrorKind};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4};
 use std::sync::OnceLock;
 
 use socket2::{Domain, Protocol, Socket, Type};
@@ -92,6 +92,19 @@ impl GossipSocket {
 /// True if an address belongs to this machine: a socket can be bound to it.
 pub(crate) fn is_of_this_machine(ip: IpAddr) -> bool {
     ip.is_loopback() || ip.is_unspecified() || std::net::UdpSocket::bind((ip, 0)).is_ok()
+}
+
+/// The address of this machine from which datagrams to another one come; `None` without a route.
+pub(crate) fn source_towards(peer: SocketAddr) -> Option<IpAddr> {
+    let unspecified = match peer {
+        SocketAddr::V4(_) => IpAddr::from(Ipv4Addr::UNSPECIFIED),
+        SocketAddr::V6(_) => IpAddr::from(Ipv6Addr::UNSPECIFIED),
+    };
+    // Connecting a UDP socket sends nothing.
+    let socket = std::net::UdpSocket::bind((unspecified, 0)).ok()?;
+    socket.connect(peer).ok()?;
+    let source = socket.local_addr().ok()?.ip();
+    (!source.is_loopback() && !source.is_unspecified()).then_some(source)
 }
 
 /// Receive buffer for datagrams that arrive while the node is stalled, in bytes.

@@ -309,17 +309,18 @@ impl Cell {
 
     /// Measurements since a mark.
     pub(crate) fn outcome(&mut self, from: Timestamp, means: Means) -> anyhow::Result<Outcome> {
-        let time = clock::now().since(from);
+        // Reading a log of large maps takes seconds, which are no gap.
+        let until = clock::now();
         let ended = self.ended()?;
         let maps = self.maps(from)?;
         Ok(Outcome {
             maps: maps.len(),
-            expected: (time.as_millis() / ROUND.as_millis()) as usize,
+            expected: (until.since(from).as_millis() / ROUND.as_millis()) as usize,
             honest: maps
                 .iter()
                 .filter(|line| line.map.reporters().is_superset(&honest()))
                 .count(),
-            longest_gap_ms: longest_gap_ms(&maps, from),
+            longest_gap_ms: longest_gap_ms(&maps, from, until),
             is_replaced: maps
                 .last()
                 .is_some_and(|line| line.map.aggregator != LEADER),
@@ -461,12 +462,12 @@ fn is_member(name: &str) -> bool {
     honest().contains(name) || VEHICLES.contains(&name)
 }
 
-/// Longest time without a map since `from`, up to now.
-fn longest_gap_ms(maps: &[Line], from: Timestamp) -> u64 {
+/// Longest time without a map between two times.
+fn longest_gap_ms(maps: &[Line], from: Timestamp, until: Timestamp) -> u64 {
     let times = [from]
         .into_iter()
         .chain(maps.iter().map(|line| line.received_at_us))
-        .chain([clock::now()]);
+        .chain([until]);
     let times: Vec<_> = times.collect();
     let longest = times
         .windows(2)
@@ -553,6 +554,17 @@ fn configuration(
     }
     // Objects away from the landmark are tracked, so that attackers can fill the map.
     text + LANDMARK + "\n[fusion.tracks]\nmode = \"on\"\n"
+}
+
+#[test]
+fn gap_ends_with_measurement() {
+    let line = |ms: u64| Line {
+        received_at_us: Timestamp(1000 * ms),
+        map: serde_json::from_str(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#).unwrap(),
+    };
+    let maps = [line(100), line(250), line(300)];
+    let gap_ms = |until_ms: u64| longest_gap_ms(&maps, Timestamp(0), Timestamp(1000 * until_ms));
+    assert_eq!([gap_ms(320), gap_ms(700)], [150, 400]);
 }
 
 #[test]

@@ -183,7 +183,7 @@ impl Cell {
         for node in self.nodes.iter_mut().filter(|node| node.process.is_some()) {
             let log = node.door_log();
             node.door = Some(doors::open(
-                node.address.broker,
+                (Ipv4Addr::LOCALHOST, node.address.broker.port()).into(),
                 node.namespace.as_deref(),
                 &log,
             )?);
@@ -340,7 +340,7 @@ impl Cell {
         self.bridged()?.split(&self.apart)
     }
 
-    /// The leader's packets do not reach the last vehicle that may lead, or do again.
+    /// The leader's packets do not reach the last vehicle that may lead, or do again. The standby's broker relays the maps.
     pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
         let nodes = self.nodes.len();
         let last = (0..nodes)
@@ -348,6 +348,11 @@ impl Cell {
             .context("the cell has no nodes")?;
         self.unreached = cut.then_some(last);
         self.bridged()?.cut_one_way(EDGE, last, cut)
+    }
+
+    /// Gives a node another address.
+    pub(crate) fn readdress(&mut self, node: usize) -> anyhow::Result<()> {
+        self.bridged()?.readdress(node)
     }
 
     /// So many percent of all packets are lost from now on.
@@ -414,11 +419,6 @@ impl Cell {
             .skip(1)
             .filter(|node| node.process.is_some());
         vehicles.map(|node| node.name.clone()).collect()
-    }
-
-    /// The vehicle that the leader does not reach, if there is one.
-    pub(crate) fn unreached(&self) -> Option<&NodeName> {
-        self.unreached.map(|node| &self.nodes[node].name)
     }
 
     /// Where the nodes' brokers listen.

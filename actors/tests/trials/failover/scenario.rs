@@ -23,6 +23,8 @@ pub(crate) enum Fault {
     Split,
     /// The leader's packets to one vehicle are lost.
     CutOneWay,
+    /// A node gets another address.
+    Readdress(Who),
     /// So many percent of all packets are lost.
     Lose(u8),
     /// The network is whole.
@@ -100,7 +102,7 @@ impl Scenario {
     /// True if it does something to the standby, which then must have been named.
     pub(crate) fn needs_standby(&self) -> bool {
         self.script.iter().any(|step| match step.fault {
-            Fault::FloodStandby => true,
+            Fault::FloodStandby | Fault::Readdress(Who::Standby) => true,
             Fault::Kill(victims) => victims.iter().any(|who| matches!(who, Who::Standby)),
             _ => false,
         })
@@ -131,7 +133,7 @@ const BASE: Scenario = Scenario {
 };
 
 /// All scenarios in the order of running.
-pub(crate) const SCENARIOS: [Scenario; 13] = [
+pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "edge_sigkill",
         script: &[measured(Fault::Kill(&[Who::Edge]), 2, (1, 1))],
@@ -225,6 +227,22 @@ pub(crate) const SCENARIOS: [Scenario; 13] = [
             measured(Fault::CutOneWay, 6, (0, 2)),
             step(Fault::Heal(Cure::OneWay), 10, (0, 2)),
         ],
+        gap: GapBar::Silent,
+        ..BASE
+    },
+    Scenario {
+        name: "edge_new_address",
+        needs: Needs::Namespaces,
+        script: &[measured(Fault::Readdress(Who::Edge), 8, (0, 2))],
+        gap: GapBar::Silent,
+        ..BASE
+    },
+    Scenario {
+        name: "standby_new_address",
+        needs: Needs::Namespaces,
+        least_nodes: 3,
+        script: &[measured(Fault::Readdress(Who::Standby), 8, (0, 0))],
+        gap: GapBar::Silent,
         ..BASE
     },
     Scenario {

@@ -15,7 +15,7 @@ pub(crate) struct Addresses {
     pub(crate) gossip: SocketAddr,
 }
 
-/// Addresses of a node: free ports on loopback, or fixed ports in a namespace.
+/// Addresses of a node: free ports on loopback, or fixed ports in a namespace, where it listens at every address.
 pub(crate) fn addresses(
     ports: &mut Ports,
     node: usize,
@@ -74,12 +74,18 @@ pub(crate) fn configuration(
     } else {
         seeds.join(", ")
     };
+    let listening = |address: SocketAddr| match plan.bridged {
+        true => SocketAddr::from((Ipv4Addr::UNSPECIFIED, address.port())),
+        false => address,
+    };
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\
          [membership]\nkey = \"a key for trials\"\nbind = \"{}\"\nseeds = [{seeds}]\n\n\
          [membership.multicast]\nenabled = {}\n\n[broker]\nallow_plaintext = true\n\n\
          [dashboard]\nenabled = false\n",
-        own.broker, own.gossip, plan.bridged
+        listening(own.broker),
+        listening(own.gossip),
+        plan.bridged
     );
     if let Some(broker) = broker {
         let _ = write!(

@@ -138,6 +138,18 @@ impl Cell {
         }
     }
 
+    /// Runs while a node sends datagrams to all others ten times a second.
+    fn say_something(&mut self, node: usize, ms: u64) {
+        for passed in 0..ms {
+            let now = self.now;
+            let machine = &mut self.nodes.get_mut(&node).unwrap().machine;
+            for member in machine.members().iter().filter(|_| passed % 100 == 0) {
+                machine.send(&member.name, b"beat", now);
+            }
+            self.run(1);
+        }
+    }
+
     fn take_arrived(&mut self) -> Vec<(Timestamp, SocketAddr, SocketAddr, Vec<u8>)> {
         let stopped =
             |to: &SocketAddr| self.nodes.get(&index(*to)).is_some_and(|node| node.stopped);
@@ -236,6 +248,48 @@ fn nodes_meet_by_multicast() {
         (member.gossip, member.broker),
         (address(2), Some(SocketAddr::from(([10, 0, 0, 2], 1883))))
     );
+}
+
+/// A node gets another address while it goes on sending. Others reach it there at once, and nobody gives it up.
+fn a_node_moves(mut cell: Cell) {
+    cell.forget_events();
+    let moving = cell.nodes.remove(&2).unwrap();
+    cell.nodes.insert(12, moving);
+    // Its next datagrams come from there already, before it has noticed.
+    cell.say_something(12, 50);
+    let now = cell.now;
+    let moved = address(12);
+    let node = cell.nodes.get_mut(&12).unwrap();
+    node.machine.move_to(moved.ip(), now);
+    cell.deliver();
+    cell.say_something(12, 30);
+    for other in [1, 3] {
+        let Node {
+            machine, events, ..
+        } = &cell.nodes[&other];
+        let members = machine.members();
+        let member = members
+            .iter()
+            .find(|member| member.name == node_name(2))
+            .unwrap();
+        assert_eq!(
+            (member.gossip, member.broker.unwrap().ip()),
+            (moved, moved.ip())
+        );
+        assert!(events.iter().any(|event| *event
+            == MembershipEvent::Changed {
+                member: member.clone()
+            }));
+    }
+    cell.say_something(12, 3000);
+    let is_end = |event: &MembershipEvent| matches!(event, MembershipEvent::Down { .. });
+    let mut events = cell.nodes.values().flat_map(|node| &node.events);
+    assert!(!events.any(is_end));
+}
+
+#[test]
+fn moved_node_is_reached_at_once() {
+    a_node_moves(Cell::of(3));
 }
 
 #[test]

@@ -37,10 +37,7 @@ impl Sessions {
         arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
         let is_accepted = self.peers.speaker_id(&hello.name) == Some(head.sender);
-        let is_there = self
-            .peers
-            .get(&head.sender)
-            .is_some_and(|peer| peer.address == arrival.from);
+        let is_there = self.peers.get(&head.sender).is_some() && !self.has_moved(head, arrival);
         let is_alive = || (arrival.known)(&hello.name).is_some_and(|known| known.alive);
         if !wants_session && is_accepted && is_there && is_alive() {
             return Ok(FrameContent::Nothing);
@@ -74,6 +71,14 @@ impl Sessions {
         let signed = body
             .get(..body.len() - attestation.len())
             .unwrap_or_default();
+        if !self.prove_certificates() {
+            let stated = message
+                .introduction()
+                .map(|introduction| introduction.id.gossip);
+            self.peers
+                .accept_counter(head, arrival.from, stated, arrival.now)?;
+        }
+        let has_moved = self.has_moved(head, arrival);
         match message {
             Handshake::Challenge { cookie, name } => {
                 if !self.proofs.allow(&head.sender, arrival.from, arrival.now) {
@@ -150,6 +155,7 @@ impl Sessions {
                         introduction,
                         answer,
                         speaks: claim != NameClaim::Taken,
+                        has_moved,
                     });
                 }
                 let attestation = decode(attestation)?;
@@ -178,6 +184,7 @@ impl Sessions {
                     introduction,
                     answer: None,
                     speaks: claim != NameClaim::Taken,
+                    has_moved,
                 })
             }
         }
@@ -319,12 +326,14 @@ impl Sessions {
             keys: Some(keys),
             is_proof: true,
         };
+        let has_moved = self.has_moved(head, arrival);
         let claim = self.admit(head, &introduction.id, admission, arrival)?;
         let answer = self.write_handshake(&own_head, &head.sender, &accept, &own_attestation);
         Ok(FrameContent::Met {
             introduction,
             answer: Some(answer),
             speaks: claim != NameClaim::Taken,
+            has_moved,
         })
     }
 
@@ -399,6 +408,13 @@ impl Sessions {
             }) if life >= id.life => NameClaim::After(life),
             _ => NameClaim::Free,
         }
+    }
+
+    /// True if the sender's session is at another address so far.
+    fn has_moved(&self, head: &FrameHeader, arrival: &Arrival<'_>) -> bool {
+        self.peers
+            .get(&head.sender)
+            .is_some_and(|peer| peer.address != arrival.from)
     }
 
     /// True if another session at another address is accepted for a name.

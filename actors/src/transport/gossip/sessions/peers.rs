@@ -103,17 +103,20 @@ impl PeerTable {
 
     /// Processes the counter of a handshake's frame in a cell without certificates. It may be far
     /// ahead, because the handshake itself proves that it is fresh. A session that is active at one
-    /// address cannot be taken over from another.
+    /// address cannot be taken over from another, unless the frame itself states (`stated`) that
+    /// its sender has moved there.
     pub(super) fn accept_counter(
         &mut self,
         head: &FrameHeader,
         from: SocketAddr,
+        stated: Option<SocketAddr>,
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
         let Some(peer) = self.peers.get_mut(&head.sender) else {
             return Ok(());
         };
-        if peer.address != from && now.since(peer.heard) < HEARD_TIME {
+        let is_placed = peer.address == from || stated == Some(from);
+        if !is_placed && now.since(peer.heard) < HEARD_TIME {
             return Err(FrameEvent::Replayed);
         }
         match peer.keys.accept(head.counter) {

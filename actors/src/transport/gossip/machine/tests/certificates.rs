@@ -62,6 +62,11 @@ fn nodes_with_certificates_meet() {
 }
 
 #[test]
+fn certified_node_is_reached_after_move() {
+    a_node_moves(CertifiedCell::of(3).cell);
+}
+
+#[test]
 fn certified_namesake_of_seed_gives_up() {
     let mut certified = CertifiedCell::new(false);
     certified.start(1);

@@ -1,0 +1,66 @@
+//! Landmarks of an open cell, which reports name: room that vehicles share.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use crate::model::names::{LandmarkId, NodeName};
+
+/// The landmarks by the vehicle that named them first, `None` for those of a former list; each
+/// vehicle's oldest first.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Arrivals(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
+
+impl Arrivals {
+    /// Adds a landmark. Returns the one that is dropped for it if there are `max` already: the
+    /// oldest of the vehicle with most, so that a vehicle that invents names only replaces its own.
+    pub(super) fn add(
+        &mut self,
+        landmark: &LandmarkId,
+        vehicle: Option<&NodeName>,
+        max: usize,
+    ) -> Option<LandmarkId> {
+        let own = self.0.entry(vehicle.cloned()).or_default();
+        own.push_back(landmark.clone());
+        if self.0.values().map(VecDeque::len).sum::<usize>() <= max {
+            return None;
+        }
+        let most = self.0.values_mut().max_by_key(|named| named.len());
+        let dropped = most.and_then(VecDeque::pop_front);
+        self.0.retain(|_, named| !named.is_empty());
+        dropped
+    }
+
+    /// Removes all landmarks.
+    pub(super) fn clear(&mut self) {
+        self.0.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn inventive_vehicle_replaces_own_names() {
+        let mut arrivals = Arrivals::default();
+        let [euclid, gauss] = ["euclid", "gauss"].map(NodeName::from_static);
+        let mut add =
+            |vehicle: &NodeName, name: String| arrivals.add(&name.into(), Some(vehicle), 10);
+        for number in 0..3 {
+            assert_eq!(add(&euclid, format!("e{number}")), None);
+        }
+        let dropped: Vec<_> = (0..100)
+            .filter_map(|number| add(&gauss, format!("g{number}")))
+            .collect();
+        assert_eq!(dropped.len(), 93);
+        assert!(dropped.iter().all(|name| name.as_str().starts_with('g')));
+        let dropped: Vec<_> = (3..8)
+            .filter_map(|number| add(&euclid, format!("e{number}")))
+            .collect();
+        let own = dropped.iter().filter(|name| name.as_str().starts_with('e'));
+        assert_eq!(
+            (dropped.len(), own.count()),
+            (5, 3),
+            "half of the room each"
+        );
+    }
+}
