@@ -176,6 +176,7 @@ audit: ## [check] licences, sources, duplicates and known vulnerabilities of all
 snapshots: ## messages, help and error texts against their snapshots; INSTA_UPDATE=always writes these anew
 	cargo test --locked --quiet --test core messages::
 	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors::
+	cargo test --locked --quiet -p ecod-region --test engine -- help::
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core

@@ -79,6 +79,30 @@ const DESCRIPTIONS: &[&str] = &[
     "[origin]\nlatitude_deg = 52",
 ];
 
+/// Command lines that cannot be carried out in an empty folder, each for another reason.
+const COMMANDS: &[&[&str]] = &[
+    &["--role", "leader"],
+    &["--name", "two/parts"],
+    &["--config", "missing.toml"],
+    &["--confg", "node.toml"],
+    &["join", "not-a-token"],
+    &["join", "ecod1-AAAA"],
+    &["pki", "issue", "edge"],
+    &["pki", "revoke", "edge"],
+    &["cell", "set", "missing.toml"],
+    &["report", "missing.jsonl"],
+    &[
+        "replay",
+        "--input",
+        "missing.jsonl",
+        "--output",
+        "maps.jsonl",
+    ],
+    &["replay", "--input", "same.jsonl", "--output", "same.jsonl"],
+    &["status", "--jsn"],
+    &["nodee"],
+];
+
 /// The text that a case is about, and the error.
 fn case(text: &str, error: &str) -> String {
     let mut shown = String::new();
@@ -122,4 +146,21 @@ fn of_descriptions() {
         case(text, &error.to_string())
     });
     insta::assert_snapshot!(refused.collect::<String>());
+}
+
+#[test]
+fn of_commands() {
+    let mut shown = String::new();
+    for arguments in COMMANDS {
+        let directory = tempfile::tempdir().unwrap();
+        let output = command(env!("CARGO_BIN_EXE_ecod-node"))
+            .args(*arguments)
+            .current_dir(directory.path())
+            .output()
+            .unwrap();
+        assert!(!output.status.success(), "{arguments:?} is carried out");
+        let text = format!("ecod-node {}", arguments.join(" "));
+        shown += &case(&text, &String::from_utf8(output.stderr).unwrap());
+    }
+    insta::assert_snapshot!(shown);
 }

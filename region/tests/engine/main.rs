@@ -3,6 +3,7 @@
 mod broker;
 mod cell;
 mod cluster;
+mod help;
 mod many;
 mod page;
 mod rights;
