@@ -261,9 +261,9 @@ impl Aggregator {
                         pace.landmarks()
                             .is_around(&Point2::new(object.x_m, object.y_m), MAX_AWAY_M)
                     };
-                    let is_placed =
-                        |object| pace.is_at_landmark(object) || is_tracking && is_near(object);
-                    let is_placed = report.objects.iter().any(is_placed);
+                    let is_placed = report.objects.iter().any(|object| {
+                        pace.is_at_landmark(object) || is_tracking && is_near(object)
+                    });
                     window.record_place(&report.node, is_placed, now);
                     let Placements { placed, misplaced } = &mut self.placements;
                     *if is_placed { placed } else { misplaced } += 1;

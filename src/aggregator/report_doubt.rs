@@ -40,11 +40,10 @@ impl ReportDoubt {
     /// The doubt about the range of the objects of a report, if there is one.
     pub(super) fn of_ranges(report: &ObjectReport) -> Option<Self> {
         let camera = Pose::from(report.pose?).position;
-        let range_m = |x_m, y_m| nalgebra::distance(&camera, &Point2::new(x_m, y_m));
         let range_m = report
             .objects
             .iter()
-            .map(|object| range_m(object.x_m, object.y_m))
+            .map(|object| nalgebra::distance(&camera, &Point2::new(object.x_m, object.y_m)))
             .fold(0.0, f64::max);
         (range_m > MAX_SEEN_RANGE_M).then_some(Self::FarObject { range_m })
     }

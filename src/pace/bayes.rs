@@ -72,12 +72,12 @@ impl BayesPace {
         self.vehicles
             .values_mut()
             .for_each(|vehicle| vehicle.move_places(&place_now));
-        let published = |landmark: &Landmark| {
+        let published_of = |landmark: &Landmark| {
             self.published
                 .get(self.landmarks.position_of(&landmark.id)?)?
                 .clone()
         };
-        let published = landmarks.landmarks().iter().map(published).collect();
+        let published = landmarks.landmarks().iter().map(published_of).collect();
         Self {
             increments: Increments::new(&config),
             config,

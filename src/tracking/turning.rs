@@ -46,8 +46,9 @@ impl TurningFrame {
         let mut rates: Vec<f64> = trusted.map(|(_, (.., rate_radps))| *rate_radps).collect();
         rates.sort_by(f64::total_cmp);
         let middle = rates.len().saturating_sub(1) / 2..=rates.len() / 2;
-        let middle = rates.get(middle).unwrap_or_default();
-        let rate_radps = middle
+        let rate_radps = rates
+            .get(middle)
+            .unwrap_or_default()
             .iter()
             .copied()
             .min_by(|a, b| a.abs().total_cmp(&b.abs()))

@@ -78,7 +78,7 @@ impl Actor for Recorder {
         } = arguments;
         let (sender, queue) = sync_channel(config.queue);
         let writer = LogWriter::new(config, identity, recording.clone());
-        let writer = std::thread::Builder::new()
+        let thread = std::thread::Builder::new()
             .name("recorder".into())
             .spawn(move || writer.run(&queue))?;
         recording.connect(Some(sender));
@@ -88,7 +88,7 @@ impl Actor for Recorder {
             recording,
             leadership,
             counters,
-            writer: Some(writer),
+            writer: Some(thread),
         })
     }
 

@@ -179,10 +179,10 @@ pub(super) fn dashboard(config: &NodeConfig, is_running: bool) -> Option<Finding
 /// Checks the port of the live log server, if configured.
 #[cfg(feature = "foxglove")]
 pub(super) fn live(config: &NodeConfig, is_running: bool) -> Option<Finding> {
-    let port = config.record.as_ref().and_then(|record| record.live_port)?;
+    let number = config.record.as_ref().and_then(|record| record.live_port)?;
     let port = Port {
         check: "live port",
-        address: SocketAddr::from(([127, 0, 0, 1], port)),
+        address: SocketAddr::from(([127, 0, 0, 1], number)),
         key: "record.live_port",
         is_running,
     };

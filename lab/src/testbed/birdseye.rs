@@ -418,8 +418,8 @@ impl BirdseyePicture<'_> {
                 .add(text(columns[1], y + 4.5, &printable(self.truth(spot))));
             if self.map.is_some() {
                 let agreed = self.state(spot).and_then(|state| state.label.as_ref());
-                let said = agreed.map_or_else(|| "unknown".to_owned(), |label| printable(label));
-                let said = text(columns[2], y + 4.5, &said)
+                let words = agreed.map_or_else(|| "unknown".to_owned(), |label| printable(label));
+                let said = text(columns[2], y + 4.5, &words)
                     .set("fill", judgement.color())
                     .set("font-weight", "bold");
                 group = group.add(said);

@@ -314,11 +314,11 @@ fn check_spots(fields: Vec<SpotFields>, place: &KeyPath) -> Result<Vec<Spot>, Te
     let mut mean = Vector2::zeros();
     for (index, spot) in fields.into_iter().enumerate() {
         let key = |name: &str| format!("spots[{index}].{name}");
-        let id = match spot.id {
+        let text = match spot.id {
             SpotId::Number(number) => format!("slot-{number}"),
             SpotId::Name(name) => format!("slot-{name}"),
         };
-        let id = place.label(&key("id"), id)?;
+        let id = place.label(&key("id"), text)?;
         if !ids.insert(id.clone()) {
             return Err(place.error(key("id"), format_args!("gives {id:?}, used before")));
         }

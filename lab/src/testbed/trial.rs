@@ -44,12 +44,12 @@ impl Trial<'_> {
         let mut by_paper = self.paper_aggregator();
         let mut voting = self.aggregator(Algorithms::Vote);
         let mut agreeing = self.aggregator(Algorithms::Both);
-        let alone = || (self.aggregator(Algorithms::Pace), SpotScore::default());
+        let unscored = || (self.aggregator(Algorithms::Pace), SpotScore::default());
         let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> = self
             .scene
             .cavs
             .iter()
-            .map(|cav| (cav.name.clone(), alone()))
+            .map(|cav| (cav.name.clone(), unscored()))
             .collect();
         let [mut score, mut paper, mut votes, mut answers] = [SpotScore::default(); 4];
         for verdict in 0..self.verdicts {

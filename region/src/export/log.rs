@@ -29,11 +29,11 @@ impl CellMapLog {
         let file =
             File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
         let mut writer = Writer::new(BufWriter::new(file))?;
-        let schema = schemas()
+        let definition = schemas()
             .remove("CellMap")
             .map(|schema| schema.to_value().to_string())
             .unwrap_or_default();
-        let schema = writer.add_schema("CellMap", "jsonschema", schema.as_bytes())?;
+        let schema = writer.add_schema("CellMap", "jsonschema", definition.as_bytes())?;
         Ok(Self {
             writer,
             schema,

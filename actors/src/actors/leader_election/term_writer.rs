@@ -93,8 +93,7 @@ impl TermWriter {
         if !is_about(&before) && self.hung_at == Some(before) {
             return TermState::Unanswered;
         }
-        let answered = self.answer.wait_for(is_about);
-        let answered = tokio::time::timeout(DISK_TIMEOUT, answered)
+        let answered = tokio::time::timeout(DISK_TIMEOUT, self.answer.wait_for(is_about))
             .await
             .ok()
             .and_then(Result::ok);

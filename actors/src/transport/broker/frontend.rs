@@ -220,7 +220,7 @@ impl FrontendState {
             .as_mut()
             .set_write_timeout_pinned(Some(WRITE_TIMEOUT));
         let wire_bytes = Arc::<AtomicUsize>::default();
-        let login = async {
+        let read = async {
             if !matches!(stream.get_ref().peek(&mut [0]).await, Ok(1)) {
                 return Err(ClientRejection::Left);
             }
@@ -244,7 +244,7 @@ impl FrontendState {
             Ok((stream, certificates, connect?))
         };
         let login = tokio::select! {
-            login = timeout_at(Instant::now() + self.handshake_timeout, login) => login.unwrap_or(Err(ClientRejection::TimedOut)),
+            login = timeout_at(Instant::now() + self.handshake_timeout, read) => login.unwrap_or(Err(ClientRejection::TimedOut)),
             () = slot.evicted() => Err(ClientRejection::Evicted),
         };
         let (stream, certificates, connect) = login?;

@@ -284,9 +284,9 @@ impl<'a> RenderView<'a> {
 /// Smooth pattern of random values from -1 to 1 with unit spacing, the same at every call.
 fn grain(at: Point2<f64>) -> f64 {
     let corner = |x: f64, y: f64| {
-        let mixed = (x as i64 as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
+        let seed = (x as i64 as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
             ^ (y as i64 as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
-        let mixed = (mixed ^ (mixed >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let mixed = (seed ^ (seed >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         (mixed >> 40) as f64 / f64::from(1 << 23) - 1.0
     };
     let x = at.x.floor();
