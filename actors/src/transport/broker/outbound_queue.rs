@@ -5,19 +5,22 @@ use std::collections::VecDeque;
 use super::packet_scanner::{PacketScanner, Piece};
 
 /// Packets for one client, in order. If there are too many, the oldest message is dropped: a late
-/// map is worthless.
+/// map is worthless. Each packet has a buffer of its own, so that a drop moves no byte of others.
 #[derive(Debug)]
 pub(super) struct OutboundQueue {
-    bytes: VecDeque<u8>,
     packets: VecDeque<QueuedPacket>,
+    /// Bytes of the first packet that were sent.
+    sent: usize,
+    /// Bytes that wait.
+    bytes: usize,
     scanner: PacketScanner,
     max_packets: usize,
 }
 
 #[derive(Debug)]
 struct QueuedPacket {
-    /// Bytes in the queue.
-    bytes: usize,
+    /// The bytes so far; of a packet that was being sent, those that came later.
+    bytes: Vec<u8>,
     /// True if the packet is a message of QoS 0 of which no byte was sent yet.
     is_droppable: bool,
 }
@@ -30,8 +33,8 @@ const MAX_BYTES: usize = 2 * 1024 * 1024;
 /// messages.
 const MAX_ANSWERS: usize = 64;
 
-/// Memory that an empty queue keeps.
-const KEPT_BYTES: usize = 16 * 1024;
+/// Length from which a packet's buffer grows slowly, and sent bytes are freed before its end.
+const LONG_BYTES: usize = 16 * 1024;
 
 /// First byte of a PUBLISH without its retain flag, if its QoS is 0.
 const PUBLISH: u8 = 0x30;
@@ -45,8 +48,9 @@ impl OutboundQueue {
     /// An empty queue for at most `max_packets` messages.
     pub(super) fn new(max_packets: usize) -> Self {
         Self {
-            bytes: VecDeque::new(),
             packets: VecDeque::new(),
+            sent: 0,
+            bytes: 0,
             scanner: PacketScanner::default(),
             max_packets,
         }
@@ -61,25 +65,25 @@ impl OutboundQueue {
                     let is_droppable = header
                         .first()
                         .is_some_and(|first| first & !RETAIN == PUBLISH);
+                    self.bytes += header.len();
                     self.packets.push_back(QueuedPacket {
-                        bytes: header.len(),
+                        bytes: header,
                         is_droppable,
                     });
-                    self.append(&header);
                 }
                 Piece::Body(body) => {
+                    self.bytes += body.len();
                     // The packet may have been sent as far as it had come.
                     match self.packets.back_mut() {
-                        Some(last) => last.bytes += body.len(),
+                        Some(last) => last.append(body),
                         None => self.packets.push_back(QueuedPacket {
-                            bytes: body.len(),
+                            bytes: body.to_vec(),
                             is_droppable: false,
                         }),
                     }
-                    self.append(body);
                 }
             }
-            while self.packets.len() > self.max_packets || self.bytes.len() > MAX_BYTES {
+            while self.packets.len() > self.max_packets || self.bytes > MAX_BYTES {
                 if self.drop_oldest() {
                     dropped += 1;
                 } else if self.packets.len() > self.max_packets + MAX_ANSWERS {
@@ -92,64 +96,65 @@ impl OutboundQueue {
         Ok(dropped)
     }
 
-    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold
-    /// twice their bytes.
-    fn append(&mut self, more: &[u8]) {
-        let length = self.bytes.len() + more.len();
-        if length > self.bytes.capacity() && length > KEPT_BYTES {
-            self.bytes.reserve_exact(more.len() + length / 8);
-        }
-        self.bytes.extend(more);
-    }
-
     /// Drops the oldest message that may be dropped. The newest packet is kept, because its end may
     /// be still to come.
     fn drop_oldest(&mut self) -> bool {
-        let mut before = 0;
-        let older = self
+        let older = self.packets.len().saturating_sub(1);
+        let oldest = self
             .packets
             .iter()
-            .take(self.packets.len().saturating_sub(1));
-        for (index, packet) in older.enumerate() {
-            if packet.is_droppable {
-                self.bytes.drain(before..before + packet.bytes);
-                self.packets.remove(index);
-                return true;
-            }
-            before += packet.bytes;
-        }
-        false
+            .take(older)
+            .position(|packet| packet.is_droppable);
+        let dropped = oldest.and_then(|index| self.packets.remove(index));
+        self.bytes -= dropped.as_ref().map_or(0, |packet| packet.bytes.len());
+        dropped.is_some()
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        self.bytes.is_empty()
+        self.bytes == 0
     }
 
     /// Number of waiting bytes.
     pub(super) fn len(&self) -> usize {
-        self.bytes.len()
+        self.bytes
     }
 
     /// The next bytes to be sent; empty only if the queue is.
     pub(super) fn next(&self) -> &[u8] {
-        self.bytes.as_slices().0
+        let first = self.packets.front();
+        first
+            .and_then(|packet| packet.bytes.get(self.sent..))
+            .unwrap_or_default()
     }
 
     /// Takes sent bytes off.
-    pub(super) fn advance(&mut self, mut sent: usize) {
-        self.bytes.drain(..sent);
+    pub(super) fn advance(&mut self, sent: usize) {
+        self.bytes -= sent;
+        self.sent += sent;
         while let Some(first) = self.packets.front_mut() {
-            if sent < first.bytes {
-                first.bytes -= sent;
-                first.is_droppable &= sent == 0;
+            if self.sent < first.bytes.len() {
+                first.is_droppable &= self.sent == 0;
+                if self.sent >= LONG_BYTES && 2 * self.sent >= first.bytes.len() {
+                    first.bytes.drain(..self.sent);
+                    self.sent = 0;
+                }
                 break;
             }
-            sent -= first.bytes;
+            self.sent -= first.bytes.len();
             self.packets.pop_front();
         }
-        if self.bytes.is_empty() && self.bytes.capacity() > KEPT_BYTES {
-            self.bytes = VecDeque::new();
+    }
+}
+
+impl QueuedPacket {
+    /// A long packet's buffer grows by an eighth: doubled, queues of clients that do not read would
+    /// hold twice their bytes.
+    fn append(&mut self, more: &[u8]) {
+        let length = self.bytes.len() + more.len();
+        if length > self.bytes.capacity() && length > LONG_BYTES {
+            self.bytes.reserve_exact(more.len() + length / 8);
         }
+        self.bytes.extend_from_slice(more);
     }
 }
 
@@ -233,13 +238,24 @@ mod tests {
             "{} {dropped}",
             queue.len()
         );
-        assert!(
-            queue.bytes.capacity() <= (MAX_BYTES + 255_010) * 9 / 8,
-            "{}",
-            queue.bytes.capacity()
-        );
+        let buffers = queue.packets.iter().map(|packet| packet.bytes.capacity());
+        let held = buffers.sum::<usize>();
+        assert!(held <= (MAX_BYTES + 255_010) * 9 / 8, "{held}");
         queue.push(&message(60, 8_000_000)).unwrap();
         assert_eq!(queue.packets.len(), 2, "what is begun and what is newest");
+    }
+
+    #[test]
+    fn drop_moves_no_begun_packet() {
+        let mut queue = OutboundQueue::new(100);
+        queue.push(&message(0, 900_000)).unwrap();
+        queue.advance(1);
+        let begun = queue.next().as_ptr();
+        let dropped: usize = (1..100)
+            .map(|mark| queue.push(&message(mark, 50_000)).unwrap())
+            .sum();
+        assert!(dropped > 70);
+        assert_eq!(queue.next().as_ptr(), begun);
     }
 
     #[test]

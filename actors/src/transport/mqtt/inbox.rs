@@ -37,10 +37,15 @@ pub(crate) struct Inbox {
     subscriber: RwLock<Subscriber>,
     /// Deliveries that receivers may still hold.
     capacity: Arc<Semaphore>,
+    max_report_hz: u32,
     report_throttles: [NodeThrottle; ReportKind::COUNT],
     ledger_throttle: NodeThrottle,
     status_throttle: NodeThrottle,
 }
+
+/// Number of small reports for which a report of the largest size counts: decoding it costs as much
+/// processor time, whether or not it is fused.
+const LARGEST_REPORTS: usize = 10;
 
 type NodeThrottle = Mutex<KeyedThrottle<NodeName>>;
 
@@ -65,6 +70,7 @@ impl Inbox {
             counters,
             subscriber: RwLock::new(subscriber),
             capacity: Arc::new(Semaphore::new(config.inbox)),
+            max_report_hz: config.max_report_hz,
             report_throttles: std::array::from_fn(|_| throttle()),
             ledger_throttle: throttle(),
             status_throttle: throttle(),
@@ -164,7 +170,7 @@ impl Inbox {
                 if self.is_shed(
                     &self.ledger_throttle,
                     ShedReason::LedgerThrottled,
-                    &node,
+                    (&node, 1),
                     received_at,
                 ) {
                     return Ok(PacketOutcome::Done);
@@ -289,7 +295,15 @@ impl Inbox {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        if self.is_shed(throttle, ShedReason::ReportThrottled, &vehicle, received_at) {
+        let size = (LARGEST_REPORTS * payload.len() / self.limits.payload_bytes) as u32;
+        let share = (1 + size).min(self.max_report_hz);
+        let is_shed = self.is_shed(
+            throttle,
+            ShedReason::ReportThrottled,
+            (&vehicle, share),
+            received_at,
+        );
+        if is_shed {
             return Ok(PacketOutcome::Done);
         }
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
@@ -312,7 +326,7 @@ impl Inbox {
             self.is_shed(
                 &self.status_throttle,
                 ShedReason::StatusThrottled,
-                vehicle,
+                (vehicle, 1),
                 received_at,
             )
         };
@@ -388,18 +402,19 @@ impl Inbox {
         PacketOutcome::Done
     }
 
-    /// Counts a message of a node that sends too many; false if there is still room for it.
+    /// Counts a message of a node that sends too many; false if there is still room for it, which
+    /// takes this share of the messages per second.
     fn is_shed(
         &self,
         throttle: &NodeThrottle,
         reason: ShedReason,
-        node: &NodeName,
+        (node, share): (&NodeName, u32),
         at: Timestamp,
     ) -> bool {
         let is_shed = !throttle
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
-            .allow(node, at);
+            .allow_many(node, share, at);
         if is_shed {
             self.counters.shed(reason, node.as_str());
         }
@@ -437,7 +452,7 @@ impl PacketSink for Inbox {
 mod tests {
     use std::collections::BTreeMap;
 
-    use ecod::wire::{Encoding, ObjectReport, Role, encode};
+    use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, encode};
 
     use super::*;
     use crate::telemetry::counters::Shed;
@@ -593,6 +608,29 @@ mod tests {
             times: 10_000 - 59,
         };
         assert_eq!(counters.all_shed(), [shed]);
+    }
+
+    #[test]
+    fn large_reports_are_decoded_less_often() {
+        let counters = Arc::new(Counters::default());
+        let (inbox, taken) = counting(&counters, |message| match message {
+            Incoming::Report { report, .. } => &report.node,
+            other => panic!("{other:?}"),
+        });
+        let topic = b"ecod/v1/lot/detections/mallory";
+        let node = "mallory";
+        for ms in 0..1000 {
+            let object = PerceivedObject::new("person", 0.5, 1.0, 2.0);
+            let report = ObjectReport {
+                objects: vec![object; 1000],
+                ..ObjectReport::new(NodeName::from_static(node), ms, Timestamp(ms))
+            };
+            let payload = encode(&report, Encoding::Json);
+            let tenths = LARGEST_REPORTS * payload.len() / inbox.limits.payload_bytes;
+            assert_eq!(tenths, 2);
+            accept(&inbox, topic, &payload, Timestamp(ms * 1000));
+        }
+        assert_eq!(taken(node), 19, "three of the reports per second each");
     }
 
     #[test]
