@@ -32,7 +32,7 @@ pub struct ElectionConfig {
     pub join_ms: u64,
     /// Additional time that each next candidate waits before it claims leadership, in ms.
     /// Default 60. It must exceed the network's usual delay. Otherwise two candidates claim at
-    /// once, and one of them has to step down.
+    /// once, and one candidate has to step down.
     pub claim_step_ms: u64,
     /// Time for which a better candidate must be fit and reachable before leadership is handed to
     /// it, in ms. Default 3000. A longer time avoids handovers to an unstable node, and keeps the

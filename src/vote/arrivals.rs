@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, VecDeque};
 
 use crate::model::names::{LandmarkId, NodeName};
 
-/// The landmarks by the vehicle that named them first, `None` for those of a former list; each
-/// vehicle's oldest first.
+/// The landmarks by the vehicle that named them first, `None` for landmarks of a former list; each
+/// vehicle's oldest landmark is first.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Arrivals(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
 
 impl Arrivals {
-    /// Adds a landmark. Returns the one that is dropped for it if there are `max` already: the
-    /// oldest of the vehicle with most, so that a vehicle that invents names only replaces its own.
+    /// Adds a landmark. If there are `max` already, drops and returns the oldest landmark of the
+    /// vehicle with most, so that a vehicle that invents names only replaces its own.
     pub(super) fn add(
         &mut self,
         landmark: &LandmarkId,

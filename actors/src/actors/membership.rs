@@ -268,7 +268,7 @@ impl MembershipState {
         self.handled.notify_one();
     }
 
-    /// Moves when the node's address is no longer one of this machine, such as after a new lease
+    /// Moves when this machine has lost the node's address, such as after a new lease
     /// of a DHCP server.
     fn check_address(&mut self, now: Timestamp) {
         let own = self.machine.own_address().ip();

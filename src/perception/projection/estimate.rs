@@ -12,7 +12,7 @@ pub(super) struct Estimate {
     pub(super) errors: Errors,
 }
 
-/// Difference of two estimates in standard deviations above which one of the estimates must be
+/// Difference of two estimates in standard deviations above which at least one estimate must be
 /// based on a false assumption.
 pub(super) const CONFLICT_SIGMAS: f64 = 3.0;
 

@@ -100,7 +100,7 @@ pub(crate) fn source_towards(peer: SocketAddr) -> Option<IpAddr> {
         SocketAddr::V4(_) => IpAddr::from(Ipv4Addr::UNSPECIFIED),
         SocketAddr::V6(_) => IpAddr::from(Ipv6Addr::UNSPECIFIED),
     };
-    // Connecting a UDP socket sends nothing.
+    // Connecting a UDP socket only selects its route.
     let socket = std::net::UdpSocket::bind((unspecified, 0)).ok()?;
     socket.connect(peer).ok()?;
     let source = socket.local_addr().ok()?.ip();

@@ -250,7 +250,7 @@ fn nodes_meet_by_multicast() {
     );
 }
 
-/// A node gets another address while it goes on sending. Others reach it there at once, and nobody gives it up.
+/// A node gets another address while it goes on sending. Others reach it there at once and keep it as a member.
 fn a_node_moves(mut cell: Cell) {
     cell.forget_events();
     let moving = cell.nodes.remove(&2).unwrap();
