@@ -7,9 +7,9 @@ use crate::model::names::{LandmarkId, NodeName};
 /// The landmarks by the vehicle that named them first, `None` for those of a former list; each
 /// vehicle's oldest first.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Arrivals(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
+pub(super) struct NamedLandmarks(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
 
-impl Arrivals {
+impl NamedLandmarks {
     /// Adds a landmark. Returns the one that is dropped for it if there are `max` already: the
     /// oldest of the vehicle with most, so that a vehicle that invents names only replaces its own.
     pub(super) fn add(
@@ -41,10 +41,9 @@ mod tests {
 
     #[test]
     fn a_vehicle_that_invents_names_replaces_its_own_and_shares_the_room() {
-        let mut arrivals = Arrivals::default();
+        let mut named = NamedLandmarks::default();
         let [euclid, gauss] = ["euclid", "gauss"].map(NodeName::from_static);
-        let mut add =
-            |vehicle: &NodeName, name: String| arrivals.add(&name.into(), Some(vehicle), 10);
+        let mut add = |vehicle: &NodeName, name: String| named.add(&name.into(), Some(vehicle), 10);
         for number in 0..3 {
             assert_eq!(add(&euclid, format!("e{number}")), None);
         }
