@@ -14,7 +14,6 @@
 //! A report is rejected if neither its `seq` nor its capture time is newer than the last of its
 //! vehicle, unless the vehicle's clock was set back.
 
-mod arrivals;
 mod calibration;
 mod config;
 mod configured_method;
@@ -28,6 +27,7 @@ mod landmark_table;
 mod landmark_votes;
 mod likelihood;
 mod method;
+mod named_landmarks;
 mod paper;
 mod visibility;
 mod weighted;
@@ -51,9 +51,9 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::wire::{
     LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict,
 };
-use arrivals::Arrivals;
 use configured_method::ConfiguredMethod;
 use method::NewVote;
+use named_landmarks::NamedLandmarks;
 
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -113,7 +113,7 @@ pub struct Vote {
     /// `None` for a landmark of an open cell.
     landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
     /// Landmarks of an open cell.
-    arrivals: Arrivals,
+    named: NamedLandmarks,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
     /// Vacancy signs that were recently read, with the time, by vehicle.
@@ -136,7 +136,7 @@ impl Vote {
                 .into_iter()
                 .map(|l| (l.id.clone(), Some(Box::new(l))))
                 .collect(),
-            arrivals: Arrivals::default(),
+            named: NamedLandmarks::default(),
             last_reports: BTreeMap::new(),
             method,
             signs: BTreeMap::new(),
@@ -163,11 +163,11 @@ impl Vote {
             .collect();
         if is_open {
             for id in self.landmarks.keys().filter(|_| !self.open) {
-                self.arrivals.add(id, None, usize::MAX);
+                self.named.add(id, None, usize::MAX);
             }
             known.extend(self.landmarks.into_keys().map(|id| (id, None)));
         } else {
-            self.arrivals.clear();
+            self.named.clear();
             known.keys().for_each(|id| method.add_landmark(id.clone()));
             self.landmarks
                 .keys()
@@ -438,7 +438,7 @@ impl Vote {
 
     fn open_landmark(&mut self, landmark: &LandmarkId, vehicle: &NodeName) {
         let max = self.config.max_landmarks;
-        if let Some(dropped) = self.arrivals.add(landmark, Some(vehicle), max) {
+        if let Some(dropped) = self.named.add(landmark, Some(vehicle), max) {
             self.landmarks.remove(&dropped);
             self.method.get_mut().remove_landmark(&dropped);
         }

@@ -7,9 +7,9 @@ use crate::model::names::{LandmarkId, NodeName};
 /// The landmarks by the vehicle that named them first, `None` for landmarks of a former list; each
 /// vehicle's oldest landmark is first.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Arrivals(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
+pub(super) struct NamedLandmarks(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
 
-impl Arrivals {
+impl NamedLandmarks {
     /// Adds a landmark. If there are `max` already, drops and returns the oldest landmark of the
     /// vehicle with most, so that a vehicle that invents names only replaces its own.
     pub(super) fn add(
@@ -41,10 +41,9 @@ mod tests {
 
     #[test]
     fn inventive_vehicle_replaces_own_names() {
-        let mut arrivals = Arrivals::default();
+        let mut named = NamedLandmarks::default();
         let [euclid, gauss] = ["euclid", "gauss"].map(NodeName::from_static);
-        let mut add =
-            |vehicle: &NodeName, name: String| arrivals.add(&name.into(), Some(vehicle), 10);
+        let mut add = |vehicle: &NodeName, name: String| named.add(&name.into(), Some(vehicle), 10);
         for number in 0..3 {
             assert_eq!(add(&euclid, format!("e{number}")), None);
         }
