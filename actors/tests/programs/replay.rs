@@ -323,14 +323,14 @@ fn impossible_request_changes_no_file() {
         (
             vec!["replay", "--input", recording, "--output", recording],
             2,
-            "both read and written",
+            "is both input and output",
         ),
         (
             vec![
                 "replay", "--config", fusion, "--input", recording, "--output", fusion,
             ],
             2,
-            "both read and written",
+            "is both input and output",
         ),
         (
             vec![

@@ -31,14 +31,14 @@ fn is_nearer(eye: &Point2<f64>, a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> O
 
 /// A side of a footprint, counter-clockwise.
 #[derive(Debug, Clone, Copy)]
-struct Side {
+struct FootprintSide {
     from: Point2<f64>,
     to: Point2<f64>,
 }
 
 /// The first side of `a` that has all of `b` beyond it.
-fn parting_side(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<Side> {
-    let mut sides = (0..4).map(|corner| Side {
+fn parting_side(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<FootprintSide> {
+    let mut sides = (0..4).map(|corner| FootprintSide {
         from: a[corner],
         to: a[(corner + 1) % 4],
     });
@@ -46,7 +46,7 @@ fn parting_side(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> Option<Side> {
 }
 
 /// True if a point is to the right of a side, outside of the footprint.
-fn is_beyond(side: Side, point: &Point2<f64>) -> bool {
+fn is_beyond(side: FootprintSide, point: &Point2<f64>) -> bool {
     (side.to - side.from).perp(&(point - side.from)) <= 0.0
 }
 

@@ -139,17 +139,17 @@ impl<'a> ConfusionModel<'a> {
 
 /// Where a camera sees an object.
 #[derive(Debug, Clone, Copy)]
-struct Sight {
+struct ObjectInView {
     /// Distance along the optical axis.
     forward_m: f64,
     bearing_rad: f64,
 }
 
 /// Where a camera sees an object; `None` out of its view.
-fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<Sight> {
+fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<ObjectInView> {
     let (range_m, bearing_rad) = pose.range_bearing(&object.position);
     let in_view = bearing_rad.abs() <= camera.horizontal_field_of_view() / 2.0;
-    (in_view && range_m > 0.0).then(|| Sight {
+    (in_view && range_m > 0.0).then(|| ObjectInView {
         forward_m: range_m * bearing_rad.cos(),
         bearing_rad,
     })
@@ -196,7 +196,7 @@ fn glimpse(
 
 impl Glimpse {
     /// The detection of an object that is now elsewhere; `None` where it leaves the image.
-    fn at(&self, camera: &Intrinsics, sight: Sight) -> Option<Detection> {
+    fn at(&self, camera: &Intrinsics, sight: ObjectInView) -> Option<Detection> {
         let recorded = &self.detection.bounding_box;
         let scale = self.forward_m / sight.forward_m;
         let x = camera.cx - camera.fx * (sight.bearing_rad + self.bearing_error_rad).tan();
