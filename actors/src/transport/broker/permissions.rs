@@ -171,15 +171,17 @@ impl Permissions {
     fn record_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
         let client = &session.id.client_id;
         let topic = TopicPlace::of(&publish.topic).1;
-        let principal = self.principals.principal(session.id.remote_addr);
-        if principal
-            .as_ref()
-            .is_some_and(|principal| self.door.is_program(principal, client))
-        {
+        let Some(principal) = self.principals.principal(session.id.remote_addr) else {
+            // Its connection ended while the broker handled its last message: no client is to blame.
+            tracing::debug!(%client, topic, "message of an ended connection dropped");
+            return;
+        };
+        if self.door.is_program(&principal, client) {
             return self.door.record_refusal(client, topic, refusal);
         }
-        let identity = principal.and_then(|principal| principal.identity);
-        let may_lead = identity.is_some_and(|identity| identity.may_serve());
+        let may_lead = principal
+            .identity
+            .is_some_and(|identity| identity.may_serve());
         let topic_of_leader = self.policy.topics.parse(topic).is_some_and(|topic| {
             matches!(
                 topic,
