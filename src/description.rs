@@ -11,7 +11,7 @@
 //! needs no signature, and other members cannot change the cell alone. Nodes that cannot lead only
 //! follow.
 //!
-//! Call [`DescriptionExchange::receive`] for every authenticated stamp, [`DescriptionExchange::take`]
+//! Call [`DescriptionExchange::receive`] for every authenticated stamp, [`DescriptionExchange::on_description`]
 //! for every body, [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership
 //! and membership change, [`DescriptionExchange::revoke`] when certificates are revoked, and
 //! [`DescriptionExchange::tick`] about twice in [`PUBLISH_INTERVAL`]. Equal inputs give equal

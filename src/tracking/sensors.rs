@@ -257,7 +257,8 @@ impl SensorModel {
         };
         let reported = Vector2::new(object.x_m, object.y_m);
         let error = self.pose_bias.corrector()(&reported) - reported;
-        let variance = stated.matrix().trace() / 2.0 + config.noise_floor_m.powi(2);
+        let variance =
+            stated.matrix().trace() / 2.0 + config.noise_floor_m.powi(2) + config.common_m.powi(2);
         self.pose_bias.consistency() < MIN_CONSISTENCY
             && error.norm_squared() > CERTAIN_SQUARED * variance
     }

@@ -18,14 +18,20 @@ impl NamedLandmarks {
         vehicle: Option<&NodeName>,
         max: usize,
     ) -> Option<LandmarkId> {
-        let own = self.0.entry(vehicle.cloned()).or_default();
-        own.push_back(landmark.clone());
-        if self.0.values().map(VecDeque::len).sum::<usize>() <= max {
-            return None;
+        let vehicle = vehicle.cloned();
+        let mut dropped = None;
+        if self.0.values().map(VecDeque::len).sum::<usize>() >= max {
+            let most = self.0.iter_mut().max_by_key(|(owner, named)| {
+                let is_own = **owner == vehicle;
+                (named.len() + usize::from(is_own), is_own)
+            });
+            dropped = most.and_then(|(_, named)| named.pop_front());
+            self.0.retain(|_, named| !named.is_empty());
         }
-        let most = self.0.values_mut().max_by_key(|named| named.len());
-        let dropped = most.and_then(VecDeque::pop_front);
-        self.0.retain(|_, named| !named.is_empty());
+        self.0
+            .entry(vehicle)
+            .or_default()
+            .push_back(landmark.clone());
         dropped
     }
 
@@ -61,5 +67,24 @@ mod tests {
             (5, 3),
             "half of the room each"
         );
+    }
+
+    #[test]
+    fn room_of_single_names_stays_bounded() {
+        let mut named = NamedLandmarks::default();
+        for vehicle in 0..10 {
+            let vehicle = NodeName::new(format!("a{vehicle}")).unwrap();
+            assert_eq!(
+                named.add(&vehicle.as_str().into(), Some(&vehicle), 10),
+                None
+            );
+        }
+        let last = NodeName::from_static("z");
+        let dropped: Vec<_> = (0..100)
+            .filter_map(|number| named.add(&format!("z{number}").into(), Some(&last), 10))
+            .collect();
+        assert_eq!(dropped.len(), 100);
+        assert_eq!(dropped[0].as_str(), "a9");
+        assert_eq!(dropped[1].as_str(), "z0");
     }
 }

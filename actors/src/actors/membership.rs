@@ -278,7 +278,7 @@ impl MembershipState {
         }
         let members = self.machine.members().into_iter();
         let source = members.map(|member| member.gossip).find_map(source_towards);
-        if let Some(ip) = source.filter(|_| self.has_own_address) {
+        if let Some(ip) = source.filter(|ip| self.has_own_address && *ip != own) {
             tracing::info!(address = %ip, before = %own, "this node has another address");
             self.machine.move_to(ip, now);
         }

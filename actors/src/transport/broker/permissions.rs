@@ -29,7 +29,7 @@ use rmqtt::types::{
 
 use super::door::{BoxRoute, Door, DoorRefusal, TopicPlace};
 use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
-use crate::telemetry::counters::Counters;
+use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::ENVELOPE_BYTES;
 use crate::transport::pki::{CertificateSubject, Credentials};
 
@@ -172,8 +172,9 @@ impl Permissions {
         let client = &session.id.client_id;
         let topic = TopicPlace::of(&publish.topic).1;
         let Some(principal) = self.principals.principal(session.id.remote_addr) else {
-            // Its connection ended while the broker handled its last message: no client is to blame.
-            tracing::debug!(%client, topic, "message of an ended connection dropped");
+            // The connection has ended, so the refusal is counted without its source.
+            self.policy.counters.count(Event::ClientDenied);
+            tracing::debug!(%client, topic, "message of an ended connection refused");
             return;
         };
         if self.door.is_program(&principal, client) {

@@ -90,13 +90,14 @@ pub(crate) enum Handshake {
 }
 
 impl Handshake {
-    /// What the sender states about itself, except in a challenge.
-    pub(crate) fn introduction(&self) -> Option<&Introduction> {
+    /// The cookie that the sender returns, and what it states about itself; `None` for a challenge.
+    pub(crate) fn answer(&self) -> Option<(&Cookie, &Introduction)> {
         match self {
             Self::Challenge { .. } => None,
-            Self::Proof { introduction, .. } | Self::Accept { introduction, .. } => {
-                Some(introduction)
+            Self::Proof {
+                echo, introduction, ..
             }
+            | Self::Accept { echo, introduction } => Some((echo, introduction)),
         }
     }
 }

@@ -45,7 +45,7 @@ pub(crate) struct Inbox {
 
 /// Number of small reports for which a report of the largest size counts: decoding it costs as much
 /// processor time, whether or not it is fused.
-const LARGEST_REPORTS: usize = 10;
+const LARGEST_REPORTS: usize = 6;
 
 type NodeThrottle = Mutex<KeyedThrottle<NodeName>>;
 
@@ -295,8 +295,11 @@ impl Inbox {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        let size = (LARGEST_REPORTS * payload.len() / self.limits.payload_bytes) as u32;
-        let share = (1 + size).min(self.max_report_hz);
+        if payload.len() > self.limits.payload_bytes {
+            return Err(RejectReason::TooLarge);
+        }
+        let size = LARGEST_REPORTS * payload.len() / self.limits.payload_bytes;
+        let share = (size as u32).clamp(1, self.max_report_hz);
         let is_shed = self.is_shed(
             throttle,
             ShedReason::ReportThrottled,
@@ -620,14 +623,20 @@ mod tests {
         let topic = b"ecod/v1/lot/detections/mallory";
         let node = "mallory";
         for ms in 0..1000 {
-            let object = PerceivedObject::new("person", 0.5, 1.0, 2.0);
+            let object = PerceivedObject {
+                velocity_mps: Some([1.25, -1.25]),
+                heading_rad: Some(1.25),
+                size_m: Some([0.25, 0.25]),
+                covariance_m2: Some([0.25, 0.0, 0.25]),
+                ..PerceivedObject::new("person", 0.5, 1.0, 2.0)
+            };
             let report = ObjectReport {
                 objects: vec![object; 1000],
                 ..ObjectReport::new(NodeName::from_static(node), ms, Timestamp(ms))
             };
             let payload = encode(&report, Encoding::Json);
-            let tenths = LARGEST_REPORTS * payload.len() / inbox.limits.payload_bytes;
-            assert_eq!(tenths, 2);
+            let share = LARGEST_REPORTS * payload.len() / inbox.limits.payload_bytes;
+            assert_eq!(share, 3);
             accept(&inbox, topic, &payload, Timestamp(ms * 1000));
         }
         assert_eq!(taken(node), 19, "three of the reports per second each");

@@ -71,10 +71,12 @@ impl Sessions {
         let signed = body
             .get(..body.len() - attestation.len())
             .unwrap_or_default();
+        let answer = message.answer();
+        if let Some((echo, introduction)) = answer {
+            self.check_freshness(&head.sender, echo, introduction, arrival)?;
+        }
         if !self.prove_certificates() {
-            let stated = message
-                .introduction()
-                .map(|introduction| introduction.id.gossip);
+            let stated = answer.map(|(_, introduction)| introduction.id.gossip);
             self.peers
                 .accept_counter(head, arrival.from, stated, arrival.now)?;
         }
@@ -122,7 +124,6 @@ impl Sessions {
                 cookie,
                 introduction,
             } => {
-                self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 if !self.prove_certificates() {
                     let is_namesake = introduction.id.name == arrival.own.name;
                     let admission = Admission {
@@ -162,7 +163,6 @@ impl Sessions {
                 self.on_proof(head, signed, &attestation, introduction, &cookie, arrival)
             }
             Handshake::Accept { echo, introduction } => {
-                self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 let admission = if self.prove_certificates() {
                     let attestation = decode(attestation)?;
                     self.on_accept(head, signed, &attestation, &introduction, arrival)?

@@ -115,12 +115,13 @@ impl PeerTable {
         let Some(peer) = self.peers.get_mut(&head.sender) else {
             return Ok(());
         };
-        let is_placed = peer.address == from || stated == Some(from);
-        if !is_placed && now.since(peer.heard) < HEARD_TIME {
+        let is_taken_over = peer.address != from && now.since(peer.heard) < HEARD_TIME;
+        if is_taken_over && stated != Some(from) {
             return Err(FrameEvent::Replayed);
         }
         match peer.keys.accept(head.counter) {
-            Err(FrameEvent::Replayed) => Err(FrameEvent::Replayed),
+            // A node that has moved a moment ago is not far ahead.
+            Err(event) if is_taken_over || event == FrameEvent::Replayed => Err(event),
             _ => {
                 peer.record_received(now);
                 Ok(())
