@@ -120,9 +120,9 @@ impl Sessions {
                 Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)))
             }
             Handshake::Proof {
-                echo,
                 cookie,
                 introduction,
+                ..
             } => {
                 if !self.prove_certificates() {
                     let is_namesake = introduction.id.name == arrival.own.name;
@@ -162,7 +162,7 @@ impl Sessions {
                 let attestation = decode(attestation)?;
                 self.on_proof(head, signed, &attestation, introduction, &cookie, arrival)
             }
-            Handshake::Accept { echo, introduction } => {
+            Handshake::Accept { introduction, .. } => {
                 let admission = if self.prove_certificates() {
                     let attestation = decode(attestation)?;
                     self.on_accept(head, signed, &attestation, &introduction, arrival)?

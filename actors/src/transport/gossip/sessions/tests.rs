@@ -215,20 +215,21 @@ fn live_session_resists_takeover() {
         b.open(&proof, thief.address, now)
     };
     assert_eq!(take_over(&mut b, NOW), Err(FrameEvent::Replayed));
-    let mut mover = End::new("a", 1);
-    mover.address = SocketAddr::from(([10, 0, 0, 9], 1));
-    mover.id.gossip = mover.address;
-    mover.sessions.counter = u64::MAX - 100;
-    let hello = mover.hello();
-    let challenge = answer(b.open(&hello, mover.address, NOW));
-    let proof = answer(mover.open(&challenge, b.address, NOW));
-    assert_eq!(
-        b.open(&proof, mover.address, NOW),
-        Err(FrameEvent::CounterJump)
-    );
     let frame = a.seal(&b.id.name, b"hi");
     let heard = payload(&a, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let mut mover = End::new("a", 1);
+    mover.address = SocketAddr::from(([10, 0, 0, 8], 1));
+    mover.id.gossip = mover.address;
+    mover.sessions.counter = u64::MAX - 100;
+    let hello = mover.hello();
+    let soon = NOW + Duration::from_millis(100);
+    let challenge = answer(b.open(&hello, mover.address, soon));
+    let proof = answer(mover.open(&challenge, b.address, soon));
+    assert_eq!(
+        b.open(&proof, mover.address, soon),
+        Err(FrameEvent::CounterJump)
+    );
     let later = NOW + Duration::from_secs(1);
     assert!(
         matches!(take_over(&mut b, later), Ok(FrameContent::Met { .. })),
