@@ -400,7 +400,7 @@ impl FuserState {
         }
     }
 
-    /// Removes what only an expelled node has reported, as itself or as one of its parts.
+    /// Removes what only an expelled node has reported, as itself or as a part.
     fn expel(&mut self, node: &NodeName) {
         let vehicle = node.vehicle();
         self.last_map = self

@@ -90,7 +90,7 @@ pub(crate) enum Handshake {
 }
 
 impl Handshake {
-    /// The cookie that the sender returns, and what it states about itself; `None` for a challenge.
+    /// The returned cookie and the sender's introduction; `None` for a challenge.
     pub(crate) fn answer(&self) -> Option<(&Cookie, &Introduction)> {
         match self {
             Self::Challenge { .. } => None,
