@@ -217,9 +217,9 @@ const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
 
-/// What tells one trouble from another.
+/// Identity of a trouble in the register.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Key {
+struct TroubleKey {
     /// The subject; `None` for the node itself.
     about: Option<String>,
     kind: TroubleKind,
@@ -230,7 +230,7 @@ struct Key {
 pub struct TroubleRegister {
     /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not
     /// logged each time.
-    entries: BTreeMap<Key, KnownTrouble>,
+    entries: BTreeMap<TroubleKey, KnownTrouble>,
 }
 
 #[derive(Debug, Clone)]
@@ -369,12 +369,12 @@ impl TroubleRegister {
 
     /// True if there is room for one more entry. Lapsed entries of the same group are removed if
     /// necessary, the longest unseen first.
-    fn make_room(&mut self, key: &Key, now: Timestamp) -> bool {
+    fn make_room(&mut self, key: &TroubleKey, now: Timestamp) -> bool {
         if key.about.is_none() {
             return true;
         }
         let vehicle = key.about.as_deref().map(vehicle_of);
-        let is_of_vehicle = |other: &Key| {
+        let is_of_vehicle = |other: &TroubleKey| {
             other.about.as_deref().map(vehicle_of) == vehicle && !other.kind.is_of_strangers()
         };
         let has_share = if key.kind.is_of_strangers() {
@@ -386,7 +386,12 @@ impl TroubleRegister {
     }
 
     /// The same check for one group of at most `most` entries.
-    fn make_room_in(&mut self, most: usize, now: Timestamp, is_in: impl Fn(&Key) -> bool) -> bool {
+    fn make_room_in(
+        &mut self,
+        most: usize,
+        now: Timestamp,
+        is_in: impl Fn(&TroubleKey) -> bool,
+    ) -> bool {
         while self.entries.keys().filter(|key| is_in(key)).count() >= most {
             let lapsed = self
                 .entries
@@ -402,12 +407,12 @@ impl TroubleRegister {
     }
 }
 
-fn key(kind: TroubleKind, about: Option<&str>) -> Key {
+fn key(kind: TroubleKind, about: Option<&str>) -> TroubleKey {
     let name = |about| match plain_text(about, MAX_NAME_BYTES) {
         name if name.is_empty() => "without a name".to_owned(),
         name => name,
     };
-    Key {
+    TroubleKey {
         about: about.map(name),
         kind,
     }

@@ -98,7 +98,7 @@ impl Tracker {
         true
     }
 
-    /// Adopts the trust in all vehicles from a ledger.
+    /// Sets the trust in all vehicles by the counts of a ledger.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.sensors.adopt(ledger);
     }

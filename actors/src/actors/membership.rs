@@ -81,8 +81,8 @@ pub struct MembershipState {
     counters: Arc<FrameCounters>,
     certificates: Option<CertificateWatch>,
     renewals: Option<Renewals>,
-    /// True if the node's address belonged to this machine at the last check: behind address
-    /// translation it never does.
+    /// True if the node's address belonged to this machine at the last check. Behind address
+    /// translation the address belongs to another machine.
     has_own_address: bool,
     name: NodeName,
     myself: ActorRef<MembershipMessage>,

@@ -167,7 +167,7 @@ impl Reports {
 
 /// Cells of a moving vehicle, and their files for the vehicle.
 struct Town {
-    /// By cell; some cells have none.
+    /// By cell; a cell may have no entry.
     edges: BTreeMap<usize, NodeHandle>,
     readers: JoinSet<()>,
     directory: TempDir,

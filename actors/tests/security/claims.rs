@@ -45,7 +45,7 @@ async fn foreign_topic_is_refused() {
         .iter()
         .find(|count| count.source == "gauss" && count.reason.as_str() == "not_permitted");
     assert_eq!(by_gauss.map(|count| count.times), Some(7));
-    // The edge receives the next report, and none of the denied publications.
+    // The edge receives the next report without any of the denied publications.
     cell.honest_traffic_goes_on().await;
 }
 

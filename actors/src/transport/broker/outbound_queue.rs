@@ -124,7 +124,7 @@ impl OutboundQueue {
         let first = self.packets.front();
         first
             .and_then(|packet| packet.bytes.get(self.sent..))
-            .unwrap_or_default()
+            .unwrap_or(&[])
     }
 
     /// Takes sent bytes off.

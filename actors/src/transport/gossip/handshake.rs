@@ -348,7 +348,7 @@ impl SignedMessage<'_> {
     }
 }
 
-/// What the keys of a handshake are derived from.
+/// Inputs of the derivation of a handshake's keys.
 pub(crate) struct KeyAgreement<'a> {
     pub(crate) cell: &'a CellKey,
     /// This node's ephemeral key.

@@ -61,7 +61,7 @@ pub(crate) struct Sessions {
     counters: Arc<FrameCounters>,
 }
 
-/// What a node's sessions are made from.
+/// Arguments of [`Sessions::new`].
 pub(crate) struct SessionsSetup<'a> {
     pub(crate) cell: NodeName,
     pub(crate) key: CellKey,

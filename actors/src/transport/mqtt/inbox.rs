@@ -170,7 +170,8 @@ impl Inbox {
                 if self.is_shed(
                     &self.ledger_throttle,
                     ShedReason::LedgerThrottled,
-                    (&node, 1),
+                    &node,
+                    1,
                     received_at,
                 ) {
                     return Ok(PacketOutcome::Done);
@@ -295,15 +296,14 @@ impl Inbox {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        if payload.len() > self.limits.payload_bytes {
-            return Err(RejectReason::TooLarge);
-        }
-        let size = LARGEST_REPORTS * payload.len() / self.limits.payload_bytes;
-        let share = (size as u32).clamp(1, self.max_report_hz);
+        let bytes = payload.len().min(self.limits.payload_bytes);
+        let size = LARGEST_REPORTS * bytes / self.limits.payload_bytes;
+        let count = (size as u32).clamp(1, self.max_report_hz);
         let is_shed = self.is_shed(
             throttle,
             ShedReason::ReportThrottled,
-            (&vehicle, share),
+            &vehicle,
+            count,
             received_at,
         );
         if is_shed {
@@ -329,7 +329,8 @@ impl Inbox {
             self.is_shed(
                 &self.status_throttle,
                 ShedReason::StatusThrottled,
-                (vehicle, 1),
+                vehicle,
+                1,
                 received_at,
             )
         };
@@ -405,19 +406,20 @@ impl Inbox {
         PacketOutcome::Done
     }
 
-    /// Counts a message of a node that sends too many; false if there is still room for it, which
-    /// takes this share of the messages per second.
+    /// Charges `count` messages to the rate of a node. Returns true, and counts the message as shed, if
+    /// the node sends more than its rate allows.
     fn is_shed(
         &self,
         throttle: &NodeThrottle,
         reason: ShedReason,
-        (node, share): (&NodeName, u32),
+        node: &NodeName,
+        count: u32,
         at: Timestamp,
     ) -> bool {
         let is_shed = !throttle
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
-            .allow_many(node, share, at);
+            .allow_many(node, count, at);
         if is_shed {
             self.counters.shed(reason, node.as_str());
         }
