@@ -53,12 +53,13 @@ use crate::wire::{
     PerceivedObject, RejectReason, ReportKind, Reputation, Verdict, Verdicts,
 };
 
-/// A closed round.
+/// Result of a closed round: the payloads that the leader publishes, and the evidence for its
+/// ledger.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fused {
     /// The leadership that closed it.
     pub epoch: Epoch,
-    /// Its number.
+    /// Number of the round. A new leader continues the numbers of the leader before it.
     pub round: u64,
     /// The map, if the cell runs PACE.
     pub map: Option<GlobalMap>,
@@ -104,7 +105,6 @@ pub struct Aggregator {
     placements: Placements,
     expelled: Expelled,
     neighbours: NeighbourView,
-    /// Weight of the initial score in published reputations, in votes.
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty

@@ -9,9 +9,9 @@ use std::fmt::Display;
 pub struct ConfigError {
     /// Full key, such as `pace.gate_m`.
     pub key: String,
-    /// The value found.
+    /// The value found, as text.
     pub value: String,
-    /// The allowed values.
+    /// The allowed values as a phrase, such as `a number from 0.1 to 100`.
     pub allowed: String,
 }
 

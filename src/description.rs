@@ -77,19 +77,19 @@ const MAX_NODES: usize = 4096;
 pub enum DescriptionEffect {
     /// Save a description, apply it, and announce to other nodes that this node has it.
     Adopt {
-        /// The description.
+        /// The description to use from now on.
         description: Arc<CellDescription>,
         /// The candidate that stated it.
         stated_by: NodeName,
     },
     /// Publish the description, retained.
     Publish {
-        /// The description.
+        /// The complete description, as this node has it.
         description: Arc<CellDescription>,
     },
     /// Count a version that is too far ahead, by its sender.
     CountImplausible {
-        /// The sender.
+        /// Node that stated the version.
         from: NodeName,
     },
 }
@@ -106,7 +106,7 @@ enum Leader {
 /// A node's statement about its description.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DescriptionStatement {
-    /// Version and hash.
+    /// Version and hash of the description that the node has; version 0 without one.
     pub stamp: DescriptionStamp,
     /// True if the node may lead.
     pub may_lead: bool,

@@ -27,17 +27,17 @@ macro_rules! trouble_kinds {
         }
 
         impl TroubleKind {
-            /// All kinds.
+            /// All kinds in order of declaration.
             pub const ALL: &'static [Self] = &[$(Self::$kind),*];
 
-            /// Stable name.
+            /// Name on the wire and on the page, such as `clock_off`; later versions keep it.
             pub fn as_str(self) -> &'static str {
                 match self {
                     $(Self::$kind => $name,)*
                 }
             }
 
-            /// The remedy.
+            /// Advice to the operator, without a capital letter and a full stop.
             pub fn remedy(self) -> &'static str {
                 match self {
                     $(Self::$kind => $remedy,)*

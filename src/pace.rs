@@ -118,14 +118,14 @@ pub struct PaceRound {
 /// PACE in the configured mode.
 #[derive(Debug, Clone)]
 pub enum Pace {
-    /// See [`PaceMode::Paper`].
+    /// PACE as the paper prints it, see [`PaceMode::Paper`].
     Paper(PaperPace),
-    /// See [`PaceMode::Bayes`].
+    /// PACE with evidence of presence and of absence, see [`PaceMode::Bayes`].
     Bayes(BayesPace),
 }
 
 impl Pace {
-    /// PACE without evidence.
+    /// Creates PACE without evidence, in the mode of `config`, which must be valid.
     pub fn new(config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         match config.mode {
             PaceMode::Paper => Self::Paper(PaperPace::new(&config, landmarks)),
@@ -154,7 +154,7 @@ impl Pace {
         }
     }
 
-    /// The landmarks.
+    /// The landmarks, in the order in which rounds list them.
     pub fn landmarks(&self) -> &LandmarkIndex {
         self.places().0
     }

@@ -151,7 +151,7 @@ impl Summary {
 /// Lines that were rejected for one reason.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Rejections {
-    /// Their number.
+    /// Number of rejected lines.
     pub lines: u64,
     /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones
     /// included.

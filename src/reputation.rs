@@ -30,7 +30,7 @@ use crate::wire::MAX_INTEGER;
 /// A settled vote: it is final whether the vote agreed with the verdict.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Evidence {
-    /// The vehicle.
+    /// Vehicle that voted.
     pub node: NodeName,
     /// The label that it stated.
     pub label: Label,
@@ -43,19 +43,18 @@ pub struct Evidence {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counts {
-    /// Votes that agreed.
+    /// Number of votes that agreed with the verdict.
     pub correct: u64,
-    /// Votes that did not.
+    /// Number of votes that disagreed with the verdict.
     pub incorrect: u64,
 }
 
 impl Counts {
-    /// All votes.
+    /// Number of votes that agreed or disagreed.
     pub fn total(self) -> u64 {
         self.correct.saturating_add(self.incorrect)
     }
 
-    /// Counts one vote.
     pub(crate) fn add(&mut self, correct: bool) {
         let count = if correct {
             &mut self.correct
@@ -83,7 +82,7 @@ fn sum(one: u64, other: u64) -> u64 {
 }
 
 config_section! {
-    /// Settings of reputations.
+    /// Settings of the reputation that a vehicle gets from its evidence.
     pub struct ReputationConfig {
         /// Score of a vehicle without evidence, 0.3 to 1; default 0.5. It should be below the score
         /// of a proven vehicle.

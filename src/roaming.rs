@@ -32,9 +32,9 @@ pub const TURN_PAUSE: Duration = Duration::from_secs(5);
 /// A cell in a vehicle's list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownCell {
-    /// Its name.
+    /// Name of the cell, by which the vehicle joins it.
     pub name: NodeName,
-    /// Its middle.
+    /// Origin of the cell's frame; the cell is the circle of `radius_m` around it.
     pub origin: GeographicOrigin,
     /// Radius of the cell in metres.
     pub radius_m: f64,

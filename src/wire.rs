@@ -125,7 +125,7 @@ pub struct ObjectReport {
 }
 
 impl ObjectReport {
-    /// An empty report.
+    /// Creates a report of the current schema version without pose and objects.
     pub fn new(node: NodeName, seq: u64, captured_at: Timestamp) -> Self {
         Self {
             schema: SCHEMA_VERSION,

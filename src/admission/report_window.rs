@@ -90,7 +90,6 @@ impl ReportWindow {
         }
     }
 
-    /// Applies new settings.
     pub(crate) fn configure(&mut self, config: WindowConfig) {
         self.config = config;
     }

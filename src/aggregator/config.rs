@@ -14,11 +14,11 @@ use crate::vote::VoteConfig;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithms {
-    /// Maps only.
+    /// PACE: rounds produce maps.
     Pace,
-    /// Verdicts only.
+    /// VOTE: rounds produce verdicts.
     Vote,
-    /// Maps and verdicts.
+    /// PACE and VOTE: rounds produce maps and, from the first vote on, verdicts.
     #[default]
     Both,
 }
@@ -46,11 +46,11 @@ pub struct FusionConfig {
     pub window: WindowConfig,
     /// The interval of rounds.
     pub round: RoundConfig,
-    /// Parameters of PACE.
+    /// Parameters of PACE; without effect if `algorithms` is `vote`.
     pub pace: PaceConfig,
     /// Parameters of tracking, which produces the objects in maps that are not at a landmark.
     pub tracks: TracksConfig,
-    /// Parameters of VOTE.
+    /// Parameters of VOTE; without effect if `algorithms` is `pace`.
     pub vote: VoteConfig,
     /// Parameters of the published reputations.
     pub reputation: ReputationConfig,

@@ -16,7 +16,6 @@ const MEMORY: Duration = Duration::from_secs(60);
 /// ahead.
 const GRACE: Duration = Duration::from_millis(500);
 
-/// Expelled vehicles.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Expelled(BTreeMap<NodeName, Expulsion>);
 

@@ -10,7 +10,7 @@ use crate::wire::CellDescription;
 /// A description and the nodes that it may have come from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct AttributedDescription {
-    /// The description.
+    /// The description as it was stated or set.
     #[serde(flatten)]
     pub description: Arc<CellDescription>,
     /// Certificates in base64 of the candidates that stated the description when it was adopted.
@@ -40,7 +40,7 @@ impl AttributedDescription {
 /// that a node saves.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DescriptionHistory {
-    /// The current description.
+    /// The description in use; `None` before the node has one.
     #[serde(flatten)]
     pub current: Option<AttributedDescription>,
     /// Those before, oldest first.

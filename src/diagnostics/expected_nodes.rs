@@ -20,7 +20,7 @@ const DEPARTURE: Duration = Duration::from_secs(10);
 /// An expected node that does not answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MissingNode {
-    /// Its name.
+    /// Name of the node that does not answer.
     pub name: NodeName,
     /// The role with which it was started.
     pub role: Role,

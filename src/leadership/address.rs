@@ -26,7 +26,7 @@ impl BrokerAddress {
         &self.host
     }
 
-    /// The TCP port.
+    /// The TCP port, 1 to 65535.
     pub fn port(&self) -> u16 {
         self.port
     }

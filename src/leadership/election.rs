@@ -217,7 +217,7 @@ impl Election {
         self.clock.outside(self.deadline())
     }
 
-    /// The node's name.
+    /// Name of the node on which this election runs.
     pub fn name(&self) -> &NodeName {
         &self.id
     }

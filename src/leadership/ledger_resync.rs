@@ -77,7 +77,6 @@ pub struct LedgerResync {
     wait: u32,
     /// Number of times that this will still happen.
     repeats: u32,
-    /// The latest leaders.
     followed: BTreeMap<NodeName, Followed>,
     growth: GrowthLimit,
 }
@@ -97,7 +96,7 @@ pub struct Merged {
     pub is_news: bool,
     /// Reasons why entries were left out.
     pub refused: Vec<RejectReason>,
-    /// Shares to publish.
+    /// Shares to publish now, in this order; empty if all evidence has been shared.
     pub shares: Vec<LedgerShare>,
 }
 

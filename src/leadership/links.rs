@@ -50,9 +50,10 @@ impl fmt::Display for LinkState {
 pub struct Brokers {
     /// The node's own broker.
     pub own: Option<BrokerAddress>,
-    /// The leader's broker.
+    /// Broker of the leader; `None` if its address is unavailable. While there is no leader, the
+    /// last leader's broker.
     pub leader: Option<BrokerAddress>,
-    /// The standby's broker.
+    /// Broker of the standby; `None` without a standby, or if its address is unavailable.
     pub standby: Option<BrokerAddress>,
     /// Brokers at which the node could not log in when they were used: it tries on.
     pub missing: Vec<BrokerAddress>,
@@ -79,7 +80,7 @@ pub struct Links {
 }
 
 impl Links {
-    /// No links yet.
+    /// Creates the links of a node that uses no broker yet.
     pub fn new(plane: DataPlane) -> Self {
         Self {
             plane,

@@ -50,7 +50,8 @@ use members::Members;
 /// Maximum number of nodes whose runs are stored, because brokers may report any number of names.
 const MAX_RUNS: usize = 4096;
 
-/// One node's leadership.
+/// State machine of one node's leadership: the election, the health of the node's parts, and the
+/// links that follow from the leader.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct LeadershipNode {
     election: Election,

@@ -9,7 +9,7 @@ use crate::wire::Role;
 pub struct Rights {
     /// The highest role: `edge` above `auto` above `cav`.
     pub role: Role,
-    /// The highest priority.
+    /// The highest priority; a higher value leads first.
     pub priority: u8,
     /// True for an operator's node: it may set the description of the cell.
     pub may_describe: bool,

@@ -61,7 +61,7 @@ pub struct RoundFilter {
 pub struct AcceptedRound {
     /// The leadership that published it.
     pub epoch: Epoch,
-    /// Its number.
+    /// Number of the round in that leadership.
     pub round: u64,
     /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no
     /// maps come.

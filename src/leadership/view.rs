@@ -38,7 +38,7 @@ pub enum Position {
     Following,
     /// It follows, and is the next leader.
     StandingBy,
-    /// It leads.
+    /// The node is the epoch's leader.
     Leading,
 }
 

@@ -11,7 +11,7 @@ pub const HEADING_BOUND_RAD: f64 = TAU * (1.0 + 1e-6);
 /// Position and heading of a vehicle's camera in the world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pose {
-    /// Position in metres.
+    /// Position in the world frame in metres, east and north.
     pub position: Point2<f64>,
     /// Direction of the camera's axis in radians, counter-clockwise from +x.
     pub heading_rad: f64,
@@ -70,11 +70,11 @@ const ROUNDING: f64 = 1e-12;
 /// Symmetric 2×2 position covariance in m².
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Covariance {
-    /// Variance along x.
+    /// Variance of the position east in m².
     pub xx: f64,
     /// Covariance of x and y.
     pub xy: f64,
-    /// Variance along y.
+    /// Variance of the position north in m².
     pub yy: f64,
 }
 

@@ -83,7 +83,7 @@ pub enum StatedPose {
     /// At a position in the cell's frame in metres, with a heading in degrees clockwise from true
     /// north. Without an origin, the y axis is north.
     ByCompass(Point2<f64>, f64),
-    /// On Earth.
+    /// In latitude and longitude; the cell needs an origin to convert it.
     OnEarth(GeographicPose),
 }
 

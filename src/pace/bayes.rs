@@ -44,7 +44,7 @@ use crate::wire::{LandmarkState, ObjectReport, PerceivedObject};
 /// The beliefs about one place; most places are in view of few vehicles.
 type Beliefs<'a> = SmallVec<[NamedBelief<'a>; 16]>;
 
-/// See the module.
+/// State of PACE with evidence of presence and of absence; the module describes the algorithm.
 #[derive(Debug, Clone)]
 pub struct BayesPace {
     config: PaceConfig,

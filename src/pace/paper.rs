@@ -19,7 +19,7 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::wire::{LandmarkState, ObjectReport};
 
-/// See the module.
+/// State of PACE as the paper prints it; the module describes the algorithm.
 #[derive(Debug, Clone)]
 pub struct PaperPace {
     gate_m: f64,

@@ -15,7 +15,7 @@ use crate::model::names::{Label, LandmarkId};
 /// A location, given in the configuration, at which an object may stand.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Landmark {
-    /// The location's name.
+    /// Name of the location, unique in the cell.
     pub id: LandmarkId,
     /// Position of an object in metres.
     pub position: Point2<f64>,
@@ -43,7 +43,7 @@ impl Landmark {
 pub struct VacancySign {
     /// The text of the sign.
     pub label: Label,
-    /// Position in metres.
+    /// Position of the sign in metres, east and north.
     pub position: Point2<f64>,
 }
 

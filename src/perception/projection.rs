@@ -76,11 +76,11 @@ impl ProjectionError {
 /// The edges of the image that cut a box, so that it does not show the whole object.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Cut {
-    /// The upper edge.
+    /// True if the upper edge cuts the box.
     pub upper: bool,
-    /// The lower edge.
+    /// True if the lower edge cuts the box.
     pub lower: bool,
-    /// The left or the right edge.
+    /// True if the left or the right edge cuts the box.
     pub side: bool,
 }
 
@@ -104,12 +104,12 @@ impl Projection {
         }
     }
 
-    /// The configuration.
+    /// The settings with which this projection was created.
     pub fn config(&self) -> &ProjectionConfig {
         &self.config
     }
 
-    /// The camera.
+    /// Intrinsic parameters of the camera.
     pub fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics
     }

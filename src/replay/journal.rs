@@ -60,7 +60,7 @@ pub enum JournalEvent {
 /// Statistics of a journal's replay.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct JournalSummary {
-    /// Reports in it.
+    /// Number of reports in the journal, rejected reports included.
     pub reports: u64,
     /// Rejected reports by reason; many where a live aggregator gets the same report over two
     /// links.
@@ -153,7 +153,7 @@ impl JournalReplay {
         }
     }
 
-    /// Statistics so far.
+    /// Statistics of the entries that were replayed so far.
     pub fn summary(&self) -> &JournalSummary {
         &self.summary
     }

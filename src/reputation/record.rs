@@ -10,7 +10,6 @@ use crate::model::names::Label;
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Record {
     pub(super) labels: BTreeMap<Label, Counts>,
-    /// Their sum.
     pub(super) sum: Counts,
     pub(super) marks: Marks,
 }

@@ -23,9 +23,9 @@ pub const MAX_ENTRIES: usize = 131_072;
 /// The key of a count: an entry without its numbers.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct EntryKey {
-    /// The lane.
+    /// Leadership that counted the votes.
     pub lane: Epoch,
-    /// The vehicle.
+    /// Vehicle whose votes were counted.
     pub node: NodeName,
     /// The label that it stated.
     pub label: Label,
@@ -224,7 +224,7 @@ impl ReputationLedger {
         changed
     }
 
-    /// Number of lanes.
+    /// Number of leaderships with counts in the ledger.
     pub fn lanes(&self) -> usize {
         self.lanes.len()
     }
@@ -302,7 +302,6 @@ impl ReputationLedger {
         true
     }
 
-    /// Drops a lane.
     pub(super) fn forget(&mut self, lane: &Epoch) {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);

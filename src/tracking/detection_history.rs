@@ -30,7 +30,6 @@ impl DetectionHistory {
         self.histories.iter()
     }
 
-    /// Number of vehicles.
     pub(super) fn len(&self) -> usize {
         self.histories.len()
     }
@@ -76,7 +75,6 @@ impl DetectionHistory {
         Some(self.occupy(slot, sensor, at))
     }
 
-    /// Removes all vehicles.
     pub(super) fn clear(&mut self) {
         self.sensors.clear();
         self.histories.clear();

@@ -198,7 +198,6 @@ impl Existence {
         (present / (1.0 - present)).ln().max(-2.0 * MAX_NATS)
     }
 
-    /// Adds evidence, nats.
     pub(super) fn add(&mut self, nats: f64) {
         self.log_odds = (self.log_odds + nats).clamp(-2.0 * MAX_NATS, MAX_NATS);
     }
@@ -218,7 +217,6 @@ impl Existence {
         self.log_odds = self.log_odds.max(log_odds.min(MAX_NATS));
     }
 
-    /// The probability.
     pub(super) fn probability(&self) -> f64 {
         logistic(self.log_odds)
     }

@@ -32,12 +32,10 @@ impl TrackGrid {
         }
     }
 
-    /// Removes all tracks.
     pub(super) fn clear(&mut self) {
         self.cells.clear();
     }
 
-    /// Adds a track.
     pub(super) fn insert(&mut self, track: IndexedTrack) {
         self.cells
             .entry((self.line(track.position.x), self.line(track.position.y)))

@@ -49,7 +49,6 @@ impl Births {
 /// The time for which objects stay in the cell.
 #[derive(Debug, Clone)]
 pub(super) struct Population {
-    /// Objects that left.
     departures: f64,
     /// Seconds for which objects stayed.
     stayed_s: f64,

@@ -39,7 +39,6 @@ const MIN_CELL_M: f64 = 24.0;
 const SHARES: usize = 4;
 
 impl TrackStore {
-    /// An empty store.
     pub(super) fn new(config: &TracksConfig) -> Self {
         let TracksConfig {
             max_tracks,
@@ -77,7 +76,6 @@ impl TrackStore {
         self.reindex(self.indexed_at);
     }
 
-    /// Number of tracks.
     pub(super) fn len(&self) -> usize {
         self.tracks.len()
     }

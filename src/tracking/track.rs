@@ -79,7 +79,6 @@ pub(super) struct Track {
     pub(super) is_settled: bool,
     /// The vehicle that reports this track as its own pose.
     pub(super) vehicle: Option<SensorId>,
-    /// Number of detections.
     pub(super) hits: u32,
     /// Number of identities taken over from neighbouring cells.
     pub(super) renames: u8,

@@ -121,7 +121,6 @@ impl TrustCounts {
         counts
     }
 
-    /// Adds one statement.
     pub(super) fn count(&mut self, is_correct: bool, config: &ReputationConfig) {
         *(if is_correct {
             &mut self.correct
@@ -223,7 +222,6 @@ impl Fleet {
         self.reputation = reputation;
     }
 
-    /// Parameters of reputations.
     pub(super) fn reputation(&self) -> &ReputationConfig {
         &self.reputation
     }
@@ -241,7 +239,6 @@ impl Fleet {
         self.trust[number] = counts.trust(&self.reputation);
     }
 
-    /// Removes a vehicle.
     pub(super) fn forget(&mut self, sensor: SensorId) {
         self.trust[sensor.number()] = 0.0;
     }

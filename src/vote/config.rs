@@ -11,7 +11,7 @@ use crate::perception::landmark::check_synonyms;
 /// Maximum number of labels of a cell.
 pub const MAX_LABELS: usize = 65_535;
 
-/// The voting method.
+/// The method by which votes decide the label of a landmark.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
@@ -22,7 +22,7 @@ pub enum VoteMode {
     Paper,
 }
 
-/// Settings of VOTE.
+/// Settings of VOTE; an absent key has its default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VoteConfig {

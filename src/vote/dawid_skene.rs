@@ -53,7 +53,6 @@ impl VehicleEvidence {
         }
     }
 
-    /// Number of votes.
     pub(super) fn votes(&self) -> f64 {
         self.live.total() + self.settled.total() + self.inherited.total()
     }
@@ -170,7 +169,6 @@ impl DawidSkene {
         }
     }
 
-    /// Applies other settings.
     pub(super) fn configure(&mut self, config: WeightedConfig) {
         self.label_bias.configure(config.memory_votes);
         self.config = config;

@@ -120,7 +120,6 @@ impl Dependence {
         }
     }
 
-    /// Applies another memory.
     pub(super) fn configure(&mut self, memory: f64) {
         self.memory = memory;
     }

@@ -113,7 +113,6 @@ impl LabelBias {
         }
     }
 
-    /// Applies another memory.
     pub(super) fn configure(&mut self, memory_votes: f64) {
         self.memory_votes = memory_votes;
     }

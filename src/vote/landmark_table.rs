@@ -23,7 +23,6 @@ struct LandmarkEntry {
 }
 
 impl LandmarkTable {
-    /// Number of landmarks.
     pub(super) fn len(&self) -> usize {
         self.indices.len()
     }

@@ -7,7 +7,6 @@ use super::label_map::LabelIndex;
 pub(super) struct WeightedVote {
     /// Index of the vehicle.
     pub(super) vehicle: usize,
-    /// The stated label.
     pub(super) label: LabelIndex,
     /// Calibrated confidence × visibility, 1 for a plain vote.
     pub(super) weight: f64,

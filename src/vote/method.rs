@@ -29,17 +29,14 @@ pub(super) trait VotingMethod {
     /// Adds a landmark, so that it has a verdict even without votes.
     fn add_landmark(&mut self, landmark: LandmarkId);
 
-    /// Removes a landmark.
     fn remove_landmark(&mut self, landmark: &LandmarkId);
 
-    /// Removes vehicles.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>);
 
     /// Makes room for the label of a vote; returns the number of votes dropped for it, or `None` if
     /// there is no room.
     fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize>;
 
-    /// Counts a vote.
     fn add_vote(&mut self, vote: &NewVote<'_>);
 
     /// Ends a round: returns the landmarks with news and the votes that have turned out to be right

@@ -35,7 +35,6 @@ impl NamedLandmarks {
         dropped
     }
 
-    /// Removes all landmarks.
     pub(super) fn clear(&mut self) {
         self.0.clear();
     }

@@ -48,7 +48,6 @@ pub(super) struct PaperVoting {
 }
 
 impl PaperVoting {
-    /// Without votes.
     pub(super) fn new(config: PaperConfig) -> Self {
         Self {
             config,

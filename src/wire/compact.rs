@@ -81,7 +81,7 @@ pub(crate) trait Form<T> {
     }
 }
 
-/// Labels and ids.
+/// A label or an id as a text string.
 pub(crate) struct Text;
 
 impl Form<SmolStr> for Text {

@@ -143,7 +143,7 @@ pub struct CellDescription {
 }
 
 impl CellDescription {
-    /// Version and hash.
+    /// Version and hash, by which nodes compare descriptions.
     pub fn stamp(&self) -> DescriptionStamp {
         DescriptionStamp {
             version: self.version,
@@ -173,7 +173,7 @@ pub struct DescriptionStatus {
 }
 
 impl DescriptionStatus {
-    /// Version and hash.
+    /// Version and hash of the description that the node has.
     pub fn stamp(&self) -> DescriptionStamp {
         DescriptionStamp {
             version: self.version,

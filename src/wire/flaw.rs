@@ -15,7 +15,7 @@ use crate::model::names::MAX_NAME_BYTES;
 /// The reason why a payload was rejected, with the responsible field.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Flaw {
-    /// The reason.
+    /// Reason under which the rejection is counted.
     pub reason: RejectReason,
     /// Path of the field, as `objects[3].x_m`; empty for the whole payload.
     pub field: String,

@@ -162,7 +162,7 @@ impl FusedObject {
         }
     }
 
-    /// The position covariance.
+    /// Covariance of the position in m², east and north.
     pub fn covariance(&self) -> Covariance {
         self.covariance_m2.into()
     }

@@ -11,9 +11,9 @@ const ROOT: &str = "ecod/v1/geo";
 pub struct RegionTopic {
     /// The tile of the cell's origin.
     pub tile: Quadkey,
-    /// The cell.
+    /// Name of the cell that publishes on the topic.
     pub cell: NodeName,
-    /// The content.
+    /// Kind of the messages on the topic.
     pub kind: RegionTopicKind,
 }
 
@@ -29,7 +29,7 @@ pub enum RegionTopicKind {
 }
 
 impl RegionTopicKind {
-    /// All kinds.
+    /// All kinds in order of declaration.
     pub const ALL: [Self; 3] = [Self::Map, Self::Cell, Self::Status];
 
     /// The last level of the topic.
@@ -43,7 +43,7 @@ impl RegionTopicKind {
 }
 
 impl RegionTopic {
-    /// The full topic.
+    /// The topic with all its levels, as published over MQTT.
     pub fn path(&self) -> String {
         let Self { tile, cell, kind } = self;
         format!("{ROOT}/{}/{cell}/{}", tile.levels(), kind.level())

@@ -15,11 +15,11 @@ pub enum Topic {
     VoteDetections(NodeName),
     /// Boxes in images of a program, which the node whose broker receives them projects.
     Boxes(NodeName),
-    /// Fused maps.
+    /// Maps that the leader fuses.
     GlobalDetections,
-    /// Verdicts.
+    /// Verdicts of the leader's votes.
     GlobalVerdicts,
-    /// Reputations, retained.
+    /// Reputations of the vehicles, retained.
     Reputations,
     /// The description of the cell, retained.
     Cell,
@@ -43,7 +43,7 @@ pub enum ReportKind {
 }
 
 impl ReportKind {
-    /// All kinds.
+    /// All kinds; the index of a kind is `kind as usize`.
     pub const ALL: [Self; Self::COUNT] = [Self::Detections, Self::VoteDetections];
 
     /// Number of kinds; `kind as usize` is below it.

@@ -42,11 +42,9 @@ pub(super) struct VehicleClock {
 /// Time scale of a vehicle's stamps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TimeBase {
-    /// Its own clock.
     Own,
     /// The cell's time before its last jump.
     CellBefore,
-    /// The cell's time.
     Cell,
 }
 

@@ -10,7 +10,7 @@ use crate::model::names::NodeName;
 pub enum ElectionInput {
     /// An authenticated message arrived.
     Receive {
-        /// The message.
+        /// The message, which the caller has limited to its sender's rights.
         message: ElectionMessage,
     },
     /// The membership found a node. Messages can be sent to it from now on.
@@ -45,7 +45,7 @@ pub enum ElectionInput {
     Round {
         /// The epoch in which it was published.
         epoch: Epoch,
-        /// The round's number.
+        /// Number of the round in that epoch.
         round: u64,
     },
     /// The set of candidates at whose brokers this node should be logged in and cannot log in has
@@ -102,15 +102,15 @@ pub enum ElectionEffect {
     },
     /// Send a message once, without blocking.
     Send {
-        /// The addressee.
+        /// Node to which the message goes.
         to: NodeName,
-        /// The message.
+        /// The message; the caller adds clock stamps, description and signature.
         message: ElectionMessage,
     },
     /// Publish in this epoch from now on. Repeated with a new epoch when a leader has to renew its
     /// term.
     Lead {
-        /// The node's leadership.
+        /// Epoch of the leadership: a new term, and the name of this node.
         epoch: Epoch,
         /// The number of the next round.
         first_round: u64,
@@ -134,13 +134,13 @@ pub enum ElectionEffect {
     /// Count a message of this node whose term, round or sequence number is higher than could have
     /// been reached. The number was not applied.
     CountImplausible {
-        /// The sender.
+        /// Node that stated the number.
         from: NodeName,
     },
     /// Share all evidence about vehicles with a node: with the next leader, or with the leader that
     /// remains when a split heals.
     SendSnapshot {
-        /// The addressee.
+        /// Node that gets the evidence.
         to: NodeName,
     },
 }

@@ -281,7 +281,7 @@ impl wire::Payload for ElectionMessage {
 }
 
 impl ElectionMessage {
-    /// Encodes the message.
+    /// Encodes the message in this encoding; [`Self::decode`] reads all encodings.
     pub fn encode(&self, encoding: Encoding) -> Vec<u8> {
         wire::encode(self, encoding)
     }

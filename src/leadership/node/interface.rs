@@ -32,7 +32,7 @@ pub struct NodeSettings {
 /// Another node of the cell.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SeenMember {
-    /// Its name.
+    /// Name of the node in its cell.
     pub name: NodeName,
     /// Start of its current run, in Unix microseconds by its own clock.
     pub run: u64,
@@ -53,12 +53,12 @@ pub enum Input {
         from: NodeName,
         /// The sender's rights, as the transport proved.
         rights: Rights,
-        /// The message.
+        /// The message as received, before it is limited to the sender's rights.
         message: ElectionMessage,
     },
     /// The membership found a node, or a new run of it.
     MemberAlive {
-        /// The node.
+        /// The node with its current addresses.
         member: SeenMember,
     },
     /// A living node's addresses changed.
@@ -78,13 +78,13 @@ pub enum Input {
     },
     /// The node's own broker started or stopped listening.
     OwnBroker {
-        /// Its address.
+        /// Address at which the broker listens; `None` if it does not listen.
         address: Option<SocketAddr>,
     },
     /// A broker has shown the certificate of a node in its last handshake. It comes before the
     /// link's new state.
     BrokerProven {
-        /// The broker.
+        /// Address of the broker at the other end of the link.
         broker: BrokerAddress,
         /// Name of the node.
         node: NodeName,
@@ -93,12 +93,12 @@ pub enum Input {
     LinkChanged {
         /// The broker at its other end.
         broker: BrokerAddress,
-        /// Its state now.
+        /// State of the link from now on.
         state: LinkState,
     },
     /// A broker forwarded a node's status or its last will.
     StatusHeard {
-        /// The status.
+        /// The status; its state is `offline` in a last will.
         status: NodeStatus,
     },
     /// A round was accepted by the node's
@@ -106,12 +106,12 @@ pub enum Input {
     RoundAccepted {
         /// The epoch it was published in.
         epoch: Epoch,
-        /// Its number.
+        /// Number of the round in that epoch.
         round: u64,
     },
     /// Evidence about vehicles came from another candidate, and was verified.
     EvidenceReceived {
-        /// The candidate.
+        /// Name of the candidate that shared the evidence.
         from: NodeName,
     },
     /// The answer to [`Effect::Look`], at once.
@@ -125,7 +125,7 @@ pub enum Input {
     },
     /// The answer to [`Effect::AskParts`], later.
     PartsAnswered {
-        /// The answer.
+        /// State of broker, gateway and fuser.
         sample: HealthSample,
     },
     /// The fuser was restarted and has lost the state of leading.
@@ -166,16 +166,16 @@ pub enum Effect {
     },
     /// Send a message once, without waiting.
     Send {
-        /// The addressee.
+        /// Node to which the message goes.
         to: NodeName,
-        /// The message.
+        /// The message; the caller adds clock stamps, description and signature.
         message: ElectionMessage,
     },
     /// Publish the leadership to all other parts. It precedes the [`Effect::Lead`] that it
     /// announces, because the node's broker admits the first round only after it has received the
     /// new leader.
     PublishLeadership {
-        /// The leadership.
+        /// The leadership as this node sees it now.
         leadership: Leadership,
     },
     /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to
@@ -185,7 +185,7 @@ pub enum Effect {
     /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops
     /// no leader: availability comes before the uniqueness of epochs.
     Lead {
-        /// The node's leadership.
+        /// Epoch of the leadership: a new term, and the name of this node.
         epoch: Epoch,
         /// Number of the next round.
         first_round: u64,
@@ -201,12 +201,12 @@ pub enum Effect {
     },
     /// Keep links to these brokers.
     SetLinks {
-        /// The brokers.
+        /// All wanted links; the gateway closes links to other brokers.
         links: WantedLinks,
     },
     /// Publish this status of the node.
     PublishStatus {
-        /// The status.
+        /// The complete status, which replaces the published one.
         status: NodeStatus,
     },
     /// Share all evidence about vehicles: a node needs it to lead, or to remain the leader.
@@ -220,12 +220,12 @@ pub enum Effect {
     AskParts,
     /// Count a message of this node that states an implausibly high term or round.
     CountImplausible {
-        /// The sender.
+        /// Node that stated the number.
         from: NodeName,
     },
     /// Write to the log.
     Log {
-        /// The event.
+        /// The event to be logged.
         notice: Notice,
     },
 }
@@ -237,7 +237,7 @@ pub enum Notice {
     Fit,
     /// A part does not work, or the members do not reach the broker.
     Unfit {
-        /// The parts.
+        /// State of the parts, of which at least one does not work.
         health: Health,
     },
     /// Other machines do not reach this node's broker, so that it does not lead.
@@ -249,12 +249,12 @@ pub enum Notice {
     ProcessGone {
         /// Name of the node.
         peer: NodeName,
-        /// Its broker.
+        /// Address of the broker that ended.
         broker: BrokerAddress,
     },
     /// The leader's connection to the broker that all use broke.
     LeaderDisconnected {
-        /// The leader.
+        /// Name of the leader whose connection broke.
         peer: NodeName,
     },
     /// The node is about to be handed the lead.
@@ -270,7 +270,7 @@ pub enum Notice {
     },
     /// This node cannot log in at brokers that it should use, or it can again.
     NoLogin {
-        /// Their nodes.
+        /// All nodes at whose brokers a login is missing; empty if the node is logged in again.
         at: Vec<NodeName>,
     },
     /// This node leads, and more followers than before cannot log in at its broker.
@@ -293,7 +293,7 @@ pub enum Notice {
     },
     /// A message in another node's name was dropped.
     Misattributed {
-        /// The sender.
+        /// Node that sent the message, as the transport proved.
         from: NodeName,
         /// The name in the message.
         claimed: NodeName,

@@ -9,7 +9,7 @@ use super::{Landmark, Synonym, VacancySign};
 use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
 
-/// One landmark.
+/// One entry of `landmarks` in the configuration: a location at which an object may stand.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LandmarkConfig {
@@ -48,15 +48,15 @@ pub(crate) fn check_synonyms(synonyms: &BTreeMap<Label, Label>) -> Result<(), Co
         .try_for_each(|label| check_label("synonyms", label))
 }
 
-/// A vacancy sign.
+/// The table `vacancy` of a landmark: a sign that is in view while the location is empty.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VacancyConfig {
     /// The text of the sign.
     pub label: Label,
-    /// East in metres.
+    /// Position of the sign in metres east.
     pub x_m: f64,
-    /// North in metres.
+    /// Position of the sign in metres north.
     pub y_m: f64,
 }
 

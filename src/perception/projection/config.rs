@@ -120,7 +120,7 @@ impl ObjectSizes {
 }
 
 config_section! {
-    /// Settings of projection.
+    /// Settings of the projection from the image to the ground.
     pub struct ProjectionConfig {
         /// The method of ranging; default `auto`: from corners, otherwise from the box's height
         /// and, if the camera's height is configured, the ground. `box_height` needs upright

@@ -4,7 +4,7 @@ use super::LineOfSight;
 use super::error_sources::Errors;
 use super::level_sight::LevelSight;
 
-/// A horizontal distance.
+/// One estimate of a horizontal distance, with its errors.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Estimate {
     pub(super) distance_m: f64,

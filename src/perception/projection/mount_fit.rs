@@ -18,7 +18,7 @@ use crate::perception::camera::{Intrinsics, Mount};
 /// An estimated mount, with standard deviations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MountEstimate {
-    /// The mount.
+    /// The mount with the estimated height, pitch and roll.
     pub mount: Mount,
     /// Of the pitch, in radians.
     pub pitch_sigma_rad: f64,
@@ -31,7 +31,7 @@ pub struct MountEstimate {
 /// The reason why boxes give no mount.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MountFitError {
-    /// Too few boxes.
+    /// Fewer than [`MIN_BOXES`] whole boxes; the value is their number.
     #[error("{0} whole boxes, need {MIN_BOXES}: watch for longer, or where more people walk")]
     TooFewBoxes(usize),
     /// The people are at one distance.
