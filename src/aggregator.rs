@@ -390,6 +390,7 @@ impl Aggregator {
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
+    /// Verdicts outside a closed round, under the next number.
     fn number_verdicts(
         &mut self,
         epoch: &Epoch,
@@ -400,6 +401,7 @@ impl Aggregator {
         Verdicts::new(epoch, round, self.in_cell_time(now), verdicts)
     }
 
+    /// The number of the next round; each number is used once.
     fn take_round_number(&mut self) -> u64 {
         let round = self.next_round;
         self.next_round = round.saturating_add(1);
@@ -537,6 +539,17 @@ impl Aggregator {
         agreed.collect()
     }
 
+    /// Closes a round at `now`, in this order: PACE, tracking, VOTE, whose evidence also counts for
+    /// tracking. The landmarks of PACE and the verdicts of VOTE are agreed, expelled vehicles and
+    /// excess objects are removed, and entries that receivers would refuse are moved to `left_out`.
+    ///
+    /// Returns `None` on a standby, whose algorithms are kept warm by the same steps, and for a
+    /// round without map and verdicts.
+    ///
+    /// # Example
+    /// The leader of a cell with both algorithms closes round 89, with VOTE in mode `weighted`.
+    /// Only PACE has had reports so far: the map is published without verdicts. The first report
+    /// for VOTE arrives: from round 90 on, each round has a map and verdicts of the same number.
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let tracks = self

@@ -423,6 +423,8 @@ impl DescriptionExchange {
         entitled.or_else(many).map(|(author, _)| author)
     }
 
+    /// Replaces the current description, drops bodies that it supersedes, and pushes the effect
+    /// that saves and applies it. `stated_by` is this node for a description that was set here.
     fn adopt(&mut self, next: AttributedDescription, stated_by: NodeName) {
         let description = Arc::clone(&next.description);
         let stamp = next.description.stamp();
@@ -435,6 +437,7 @@ impl DescriptionExchange {
         });
     }
 
+    /// Publishes a description and records the time, so that the next repetition waits longer.
     fn publish(&mut self, description: Arc<CellDescription>, now: Timestamp) {
         self.is_due = false;
         self.published = Some((now, self.published.map_or(0, |(_, times)| times) + 1));
@@ -457,6 +460,8 @@ impl DescriptionExchange {
         std::mem::take(&mut self.effects)
     }
 
+    /// True if a node that this node serves lacks the description: for a leader any node, for
+    /// another candidate the leader.
     fn is_lacking(&self, stamp: DescriptionStamp) -> bool {
         let is_behind = |statement: &DescriptionStatement| statement.stamp < stamp;
         match &self.leader {

@@ -436,6 +436,8 @@ impl Vote {
         sorted.collect()
     }
 
+    /// Adds a landmark that a vehicle has named in an open cell. At the maximum, the oldest
+    /// landmark of the vehicle with most landmarks is dropped with its votes.
     fn open_landmark(&mut self, landmark: &LandmarkId, vehicle: &NodeName) {
         let max = self.config.max_landmarks;
         if let Some(dropped) = self.named.add(landmark, Some(vehicle), max) {
@@ -458,6 +460,14 @@ impl Vote {
     }
 
     /// Ends the round: evaluates the landmarks that changed.
+    ///
+    /// In `paper` mode the counts of frames start again for the next packet. A cell with a list of
+    /// landmarks gets all verdicts, an open cell the changed ones.
+    ///
+    /// # Example
+    /// Three vehicles vote `car` at `slot-3`, one votes `van`. Closing judges the landmark: the
+    /// verdict is `car`. Once one of the votes is older than `freshness_s`, all four are settled,
+    /// and the round that closes then returns four pieces of evidence, of which three are correct.
     pub fn close(&mut self, now: Timestamp) -> VoteRound {
         if self.config.mode == VoteMode::Paper {
             self.last_reports

@@ -268,6 +268,8 @@ impl Election {
         }
     }
 
+    /// Removes peers that were given up, then carries out what is due in the current state. A
+    /// follower that loses its leader starts to seek, and may claim leadership in the same call.
     fn run_timers(&mut self, now: Timestamp) {
         self.peers.forget_silent(now);
         if let State::Following(_) = self.state {
@@ -280,6 +282,8 @@ impl Election {
         }
     }
 
+    /// Ends an input: requests the term after the highest used one on disk, and returns the
+    /// collected effects.
     fn finish(&mut self) -> Vec<ElectionEffect> {
         // The next term is written to disk before it is needed, so that taking the lead does not
         // have to wait for the disk.
@@ -298,6 +302,12 @@ impl Election {
     /// sender's state, and passes the body to the handler of its kind. Messages that are repeated,
     /// overtaken or implausible are dropped before they change any state. For example, a `Beat`
     /// reaches `on_beat` only if the sender itself leads the stated epoch.
+    ///
+    /// # Example
+    /// In term 4, a beat with term 9 and epoch 9 arrives from `gauss`. The term is plausible and
+    /// the sequence number is new: the highest used term becomes 9, `gauss` counts as a candidate
+    /// that is in contact, and `on_beat` decides whether to follow it. The same beat over a second
+    /// path is dropped by its sequence number.
     fn receive(&mut self, mut message: ElectionMessage, now: Timestamp) {
         if message.from == self.id {
             return;
@@ -469,6 +479,8 @@ impl Election {
         }
     }
 
+    /// Handles a node that the membership found: adds the peer and sends it this leader's beat, or
+    /// this node's status.
     fn peer_alive(&mut self, peer: &NodeName, now: Timestamp) {
         if *peer == self.id {
             return;
@@ -481,6 +493,13 @@ impl Election {
         }
     }
 
+    /// Handles a change of the node's own parts. A change of load alone is only advertised. A
+    /// leader that becomes unfit resigns; a follower reports its changed fitness to its leader at
+    /// once.
+    ///
+    /// # Example
+    /// The fuser of the leader `edge` hangs after round 88. `edge` stops publishing, sends `Resign`
+    /// to all nodes and seeks. Its standby `gauss` leads from round 89 on.
     fn set_health(&mut self, health: Health, now: Timestamp) {
         let was_fit = self.health.is_fit();
         self.health = health;
@@ -538,6 +557,8 @@ impl Election {
         self.over = self.over.take().max(Some(epoch));
     }
 
+    /// Announces this node without waiting for a question: a vehicle that cannot lead sends its
+    /// status to its leader, every other node sends it to all peers.
     fn greet(&mut self, now: Timestamp) {
         let leader = self.leader().filter(|leader| **leader != self.id).cloned();
         match leader {
@@ -552,6 +573,8 @@ impl Election {
         }
     }
 
+    /// Sends this node's state to one peer: a greeting, the answer to a beat, or a refusal by the
+    /// highest epoch that is over.
     fn send_status(&mut self, to: &NodeName, now: Timestamp) {
         self.send(
             to,
@@ -563,6 +586,8 @@ impl Election {
         );
     }
 
+    /// Queues one message to a peer. Every message contains this node's candidacy, highest term and
+    /// current epoch, and whether the peer's messages arrive here.
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {
         self.seq += 1;
         let hears_you = self.peers.tell(to, now);

@@ -601,6 +601,8 @@ impl LedgerResync {
         untold.map(|share| self.passed_on(share)).collect()
     }
 
+    /// Splits counts and marks into shares of at most [`MAX_SHARE_ENTRIES`]. A signed share
+    /// contains entries of one lane only.
     fn shares(
         &self,
         ledger: &ReputationLedger,

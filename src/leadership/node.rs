@@ -308,6 +308,7 @@ impl LeadershipNode {
         }
     }
 
+    /// Requests a check of the node's parts if one is due, and continues a preparation.
     fn run_timers(&mut self, now: Timestamp) {
         if self.monitor.is_due(now) {
             self.effects.push(Effect::Look);
@@ -319,6 +320,7 @@ impl LeadershipNode {
         self.check_preparation(now);
     }
 
+    /// Passes one input to the election, and carries out its effects before it returns.
     fn feed(&mut self, input: ElectionInput, now: Timestamp) {
         let effects = self.election.handle(input, now);
         self.carry_out(effects, now);
@@ -388,6 +390,8 @@ impl LeadershipNode {
         }
     }
 
+    /// Handles a member that was found or restarted: its former login is dropped, the
+    /// election greets it, and the own broker must be reachable for it.
     fn member_up(&mut self, member: SeenMember, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
@@ -396,12 +400,21 @@ impl LeadershipNode {
         self.update_health(now);
     }
 
+    /// Handles a member that the membership gave up: the election decides by the leader's beats
+    /// whether it is lost.
     fn member_down(&mut self, name: NodeName, now: Timestamp) {
         self.members.member_down(&name, now);
         self.forget_login(&name, now);
         self.feed(ElectionInput::PeerDown { peer: name }, now);
     }
 
+    /// Handles a changed link: updates the node's fitness. A link that was up and is now refused
+    /// proves that the broker's process has ended, and with it each member that has this broker.
+    ///
+    /// # Example
+    /// The leader `edge` is killed. Its connection breaks (`Down`), and the next attempt is refused
+    /// (`Refused`): the node logs `ProcessGone` and passes `PeerGone` to the election, which
+    /// replaces `edge` before its beats count as missing.
     fn on_link(&mut self, broker: &BrokerAddress, state: LinkState, now: Timestamp) {
         let is_gone = self.monitor.record_link(broker, state);
         self.update_health(now);
@@ -421,6 +434,11 @@ impl LeadershipNode {
     /// connection broke is the fastest evidence of the leader's end. Any member can forge this
     /// report, so it ends the leader only once per run; later reports make this node ask about the
     /// leader.
+    ///
+    /// # Example
+    /// All nodes use one external broker, which publishes the last will of the leader `edge`. The
+    /// first will of this run ends `edge`'s leadership (`PeerGone`). A second will of the same run
+    /// may be forged: it only makes the node query `edge` (`PeerSuspected`).
     fn on_status(&mut self, status: &NodeStatus, now: Timestamp) {
         let peer = status.node.clone();
         if status.state != NodeState::Offline {
@@ -526,18 +544,24 @@ impl LeadershipNode {
         self.is_deserted = without_login > 0 && without_login == followers;
     }
 
+    /// Removes the record of a login at a node's broker, because the node left or restarted;
+    /// reports the change if the login was missing.
     fn forget_login(&mut self, name: &NodeName, now: Timestamp) {
         if self.logins.forget(name) {
             self.report_logins(now);
         }
     }
 
+    /// Logs the brokers without a login and passes their nodes to the election.
     fn report_logins(&mut self, now: Timestamp) {
         let at: Vec<_> = self.logins.missing().cloned().collect();
         self.log(Notice::NoLogin { at: at.clone() });
         self.feed(ElectionInput::NoLogin { at }, now);
     }
 
+    /// Ends the preparation of a handover when its time has come: vehicles had time to connect, the
+    /// leader's evidence has arrived or its timeout has passed, and the node is fit. Otherwise
+    /// checks again after [`PREPARATION_STEP`].
     fn check_preparation(&mut self, now: Timestamp) {
         let Some(preparation) = &mut self.preparation else {
             return;
@@ -557,6 +581,8 @@ impl LeadershipNode {
         }
     }
 
+    /// Computes the node's fitness anew from links, parts and reachability, and passes a change to
+    /// the election. Settings count as valid while there is no leader.
     fn update_health(&mut self, now: Timestamp) {
         let no_other = self.election.is_leading() && self.election.standby().is_none();
         let plane = self.links.plane();
@@ -610,6 +636,8 @@ impl LeadershipNode {
         is_reached
     }
 
+    /// Logs the change between fit and unfit, and passes every change to the election. A vehicle
+    /// that cannot lead has no fitness.
     fn set_health(&mut self, health: Health, now: Timestamp) {
         if self.is_vehicle_only || health == self.health {
             return;
@@ -659,6 +687,7 @@ impl LeadershipNode {
         self.publish_status();
     }
 
+    /// Adds [`Effect::PublishLeadership`] if this node's view of the leadership has changed.
     fn publish_leadership(&mut self) {
         let leadership = Leadership::of(&self.election, self.is_deserted);
         if leadership != self.leadership {
@@ -667,6 +696,9 @@ impl LeadershipNode {
         }
     }
 
+    /// Adds [`Effect::PublishStatus`] if state, epoch, aggregator or fitness have changed, or if
+    /// other parts of the status have changed since the last publication. A node that seeks states
+    /// the epoch of the last accepted round.
     fn publish_status(&mut self) {
         let epoch = self.leadership.present_epoch().or(self.accepted.as_ref());
         let state = if self.leadership.is_leading() {

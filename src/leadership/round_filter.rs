@@ -191,6 +191,7 @@ impl RoundFilter {
         Ok(accepted(epoch, reputations.round, false, leadership))
     }
 
+    /// Refuses a claimed round of a leadership of which a proven round was accepted before.
     fn check_origin(&self, epoch: &Epoch, origin: Origin) -> Result<(), Refusal> {
         let is_doubtful = origin == Origin::Claimed && self.proven.as_ref() == Some(epoch);
         if is_doubtful {
@@ -200,6 +201,7 @@ impl RoundFilter {
         }
     }
 
+    /// Records that the leadership proves its rounds: later rounds without proof are refused.
     fn record_origin(&mut self, epoch: &Epoch, origin: Origin) {
         if origin == Origin::Proven && self.proven.as_ref() != Some(epoch) {
             self.proven = Some(epoch.clone());
@@ -213,6 +215,7 @@ fn floor(saved_term: u64) -> u64 {
     saved_term.saturating_sub(1)
 }
 
+/// Refuses a round that was in transit for too long by its time of fusion; see [`StalenessFilter`].
 fn check_age(
     filter: &mut StalenessFilter,
     epoch: &Epoch,

@@ -54,6 +54,7 @@ impl fmt::Display for Position {
 }
 
 impl Leadership {
+    /// The view of the election's current state.
     pub(super) fn of(election: &Election, is_deserted: bool) -> Self {
         let standby = election.standby();
         let position = match election.leader() {

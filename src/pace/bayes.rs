@@ -67,6 +67,8 @@ impl BayesPace {
         }
     }
 
+    /// The same evidence under other settings. Evidence and published labels follow their landmarks
+    /// by id; evidence at removed landmarks is dropped.
     pub(super) fn configured(mut self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 2);
         self.vehicles
@@ -87,6 +89,7 @@ impl BayesPace {
         }
     }
 
+    /// Adds landmarks after the existing ones, without evidence.
     pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.config.gate_m));
         self.published
@@ -98,12 +101,16 @@ impl BayesPace {
         (&self.landmarks, self.config.gate_m)
     }
 
+    /// Counts one report: a hit or a miss at each landmark that the vehicle had in view.
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let observations = self.observations(report);
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();
         vehicle.observe(&observations, captured_at, self.increments, &self.config);
     }
 
+    /// Closes a round: drops observations older than `max_age_s`, adds the vehicles' evidence at
+    /// each landmark, and records the published label, which the next round replaces only with a
+    /// lead of `switch_lead`.
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
         let limit = now - self.config.max_age();
         let mut oldest_capture = None;

@@ -274,6 +274,8 @@ impl<'a> Assignment<'a> {
         hypothesis
     }
 
+    /// All pairs of a detection and a hypothesis that explain the detection better than clutter.
+    /// The vehicle's own track is excluded; of many near tracks only the nearest are compared.
     fn gated_pairs(&mut self, scan: &Scan<'_>) -> Vec<GatedPair> {
         let reach_m = self.config.gate_m + self.tracks.slack_m(self.at);
         let mut pairs = Vec::with_capacity(2 * scan.detections.len());
@@ -367,6 +369,7 @@ impl<'a> Assignment<'a> {
         (line(position.x), line(position.y))
     }
 
+    /// Adds the numbers of the instant's new hypotheses in the squares around a position.
     fn new_near(&self, position: &Vector2<f64>, near: &mut SmallVec<[usize; 16]>) {
         if self.new.is_empty() {
             return;

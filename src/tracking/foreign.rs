@@ -76,6 +76,7 @@ pub(super) struct NeighbourTrack {
 }
 
 impl NeighbourTrack {
+    /// A track of an object as its cell stated it, at the time of that cell's fusion.
     fn new(stated: &NeighbourObject, fused_at: Timestamp, config: &TracksConfig) -> Self {
         let NeighbourObject { cell, object, .. } = stated;
         let mut track = Track::new(

@@ -93,6 +93,8 @@ fn near_pairs(
     pairs
 }
 
+/// True if two tracks are near enough at `now` to be one object. Two vehicles that report their own
+/// poses are different objects; tracks with different labels must be nearer.
 fn may_be_one(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) -> bool {
     let distance_m = (other.state.position_at(now) - track.state.position_at(now)).norm();
     let are_vehicles = track.vehicle.is_some() && other.vehicle.is_some();

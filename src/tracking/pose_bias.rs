@@ -303,6 +303,7 @@ impl NormalEquations {
         self.turned += weighted.tr_mul(residual);
     }
 
+    /// Information matrix of translation (first two rows) and of rotation and delay (last two).
     fn information(&self) -> Matrix4<f64> {
         let mut information = Matrix4::from_diagonal_element(self.weight);
         information

@@ -160,6 +160,17 @@ impl Tracker {
     }
 
     /// Closes the round at `now`.
+    ///
+    /// Order: the frame of the round's reports is advanced, the reports update the tracks in order
+    /// of capture, poses are aligned, duplicates are merged, and lost objects are removed.
+    /// Confirmed tracks are kept after the end of their publication, so that an object that is
+    /// detected again keeps its identity.
+    ///
+    /// # Example
+    /// A car is detected in round 10: a track begins, and the map contains an object of low
+    /// confidence. Detections of a second vehicle confirm the track. Both vehicles lose the car:
+    /// the object is published for `life_s` after the last detection, and a detection within
+    /// `latent_s` continues its track.
     pub fn close(&mut self, now: Timestamp) -> TracksRound {
         let pending = std::mem::take(&mut self.pending);
         let oldest_capture = pending.iter().map(|(captured_at, _)| *captured_at).min();
@@ -271,6 +282,8 @@ impl Tracker {
         (frames, evidence)
     }
 
+    /// The objects of the map at `now`: tracks that were detected within `life_s` and are certain
+    /// enough to be published.
     fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
         let fleet = &self.sensors.fleet;
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
@@ -291,6 +304,7 @@ impl Tracker {
         published
     }
 
+    /// The corrections of the vehicles' poses for the map; empty if alignment is switched off.
     fn corrections(&self) -> BTreeMap<NodeName, PoseCorrection> {
         if !self.config.align {
             return BTreeMap::new();

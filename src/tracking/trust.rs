@@ -58,6 +58,8 @@ struct PeerEvidence {
 }
 
 impl PeerEvidence {
+    /// Collects the recent observations of one object by all vehicles except `sensor`, by the
+    /// weight of each vehicle in `fleet`.
     fn of(
         history: &DetectionHistory,
         sensor: Option<SensorId>,
@@ -83,6 +85,7 @@ impl PeerEvidence {
         peers
     }
 
+    /// Judges a statement by this evidence; `None` if the evidence is insufficient.
     fn judge(&self, statement: ExistenceStatement) -> Option<Judgement> {
         let share = f64::from(statement.hits) / f64::from(statement.looks.max(1));
         let exists = self.nats >= EXISTS_NATS;

@@ -188,6 +188,8 @@ impl Dependence {
         }
     }
 
+    /// Counts one comparison of a pair: whether both labels agree, and how often they would by
+    /// chance. Earlier comparisons fade.
     fn compare_pair(&mut self, one: ComparedVote, other: ComparedVote) {
         self.count_label(one.label);
         self.count_label(other.label);
@@ -206,6 +208,8 @@ impl Dependence {
         self.compared += 1;
     }
 
+    /// Counts a stated label for the chance agreement. The sums are halved at [`SHARES_MEMORY`], so
+    /// that old labels fade.
     fn count_label(&mut self, label: LabelIndex) {
         let label = usize::from(label);
         if self.stated.len() <= label {

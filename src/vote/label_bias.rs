@@ -58,6 +58,8 @@ impl Preferences {
         sums.squares += deviation * deviation;
     }
 
+    /// Reduces the weight of all earlier votes by `factor`, and drops labels whose share has become
+    /// negligible.
     fn fade(&mut self, factor: f64) {
         self.votes *= factor;
         self.squares *= factor * factor;
@@ -213,6 +215,8 @@ impl LabelBias {
         self.class_weight
     }
 
+    /// Sum over all labels of the variance of the vehicles' bias, relative to the share of the
+    /// label: φ² of the votes. It is about 0 if all vehicles make the same errors.
     fn phi_squared(&mut self) -> f64 {
         let mut read = 0;
         // Sums of the shares of each label, and of the variances of the bias towards it.

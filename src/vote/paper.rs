@@ -57,6 +57,7 @@ impl PaperVoting {
         }
     }
 
+    /// The score of a vehicle; a new vehicle starts with the configured initial reputation.
     fn vehicle(&mut self, node: &NodeName) -> &mut VehicleScore {
         let reputation = Reputation {
             score: self.config.initial_reputation,

@@ -47,6 +47,9 @@ impl Election {
         }
     }
 
+    /// Time of the next question about the leader, counted from its suspicion: after each beat,
+    /// after each half beat once the leader is silent, and after each `ask_period` once the direct
+    /// timeout has passed.
     fn ask_at(&self, following: &Following) -> Timestamp {
         let now = self.clock.now();
         let pause = if now >= following.direct_timeout_at(&self.config) {
@@ -62,6 +65,18 @@ impl Election {
     }
 
     /// Processes a leader's beat or claim.
+    ///
+    /// A beat of the followed epoch refreshes the leader. A seeking node follows the sender unless
+    /// it has followed a later epoch. A leader decides in `meet_leader` which of the two continues.
+    /// A follower that receives another node's claim follows it only if that node is better by rank
+    /// or number of followers; otherwise it keeps the claim and sends its status. A beat of a lower
+    /// epoch is answered by a status, so that its sender renews its term.
+    ///
+    /// # Example
+    /// `euclid` follows `edge` in term 4. `gauss` has lost contact with `edge` and claims term 5.
+    /// `euclid` keeps the claim, queries `edge`, and sends `gauss` its status, which states term
+    /// 4 of `edge`. The next beat of `edge` drops the claim. If `edge` is lost instead,
+    /// `lose_leader` follows the claim at once.
     pub(super) fn on_beat(&mut self, beat: Beat, now: Timestamp) {
         if self.is_over(&beat.epoch) {
             self.send_status(&beat.epoch.leader, now);
@@ -109,6 +124,13 @@ impl Election {
     /// followers, and for a leader of lower rank only if that leader has more followers. The
     /// follower count of each leader is the count that it states in its beats. If this node does
     /// not stop, it continues in a term above both.
+    ///
+    /// # Example
+    /// A split heals between `edge` (term 4, three followers) and `gauss` (term 5, two followers),
+    /// both of the same rank. `edge` receives the beat of term 5, has more followers, and schedules
+    /// term 6 (`contest`). `gauss` answers beats of term 4 by its own beat. When `edge` leads in
+    /// term 6, `gauss` has fewer followers: it stops publishing, sends `edge` its evidence and
+    /// follows.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else {
             return;
@@ -152,6 +174,8 @@ impl Election {
             .is_some_and(|(name, other)| name < other)
     }
 
+    /// Pushes the effects with which a leadership ends in favour of `next`: the fuser stops, and
+    /// `next` gets this node's evidence. The caller sets the new state.
     fn stop_leading(&mut self, next: &NodeName) {
         if let State::Leading(leading) = &self.state {
             self.effects.push(ElectionEffect::StopPublishing {
@@ -162,6 +186,8 @@ impl Election {
         }
     }
 
+    /// Follows the leader that sent `beat`: records epoch, round and clock, drops questions that
+    /// wait for the previous leader, and answers by a status.
     fn follow(&mut self, beat: Beat, now: Timestamp) {
         self.epoch = Some(beat.epoch.clone());
         self.observe_round(&beat.epoch.leader, beat.round);
@@ -196,6 +222,9 @@ impl Election {
         self.send_status(&leader, now);
     }
 
+    /// Handles a beat of the followed leader: restarts its deadlines, replaces the list of
+    /// successors and the interval of beats, answers questions that waited for a sign of life, and
+    /// answers by a status.
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
         self.observe_round(&beat.epoch.leader, beat.round);
         match &mut self.leader_clock {
@@ -220,6 +249,15 @@ impl Election {
     }
 
     /// Derives changes of leadership from the sender's epoch, which every message contains.
+    ///
+    /// A follower whose leader states another epoch, in a message other than a beat, closes its
+    /// own. A leader stops if more nodes follow the stated leader than this one; otherwise it
+    /// schedules a renewed term.
+    ///
+    /// # Example
+    /// `euclid` follows `edge` in term 4. `edge` has handed over to `gauss`, and its status states
+    /// term 5 of `gauss`. `euclid` closes term 4 and follows `gauss`, before the first beat of
+    /// `gauss` has arrived.
     pub(super) fn on_foreign_message(&mut self, message: &ElectionMessage, now: Timestamp) {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
@@ -324,6 +362,7 @@ impl Election {
         }
     }
 
+    /// Handles the membership's doubt: queries all nodes if the doubt concerns the leader.
     pub(super) fn peer_suspected(&mut self, peer: &NodeName, now: Timestamp) {
         if matches!(&self.state, State::Following(following) if following.epoch.leader == *peer) {
             self.ask_all(now);
@@ -344,6 +383,9 @@ impl Election {
         self.name_successors(now);
     }
 
+    /// Handles the proven end of a process: the peer is not a candidate for the response timeout.
+    /// If it was the leader, its epoch is closed, and this node follows a recent claim or seeks at
+    /// once, without waiting for a timeout.
     pub(super) fn peer_gone(&mut self, peer: &NodeName, now: Timestamp) {
         self.peers.gone(peer, now);
         match &self.state {
@@ -359,6 +401,11 @@ impl Election {
 
     /// Called when the leader is lost. Follows the node that claims leadership if its claim is
     /// recent and this node does not outrank it; otherwise starts seeking.
+    ///
+    /// # Example
+    /// `edge` is lost and had named the successors `gauss`, `euclid`. If `gauss` has claimed within
+    /// the response timeout, this node follows it. Otherwise the node seeks: `gauss` may claim at
+    /// once, and `euclid` one claim step later if no beat of `gauss` arrives.
     fn lose_leader(&mut self, now: Timestamp) {
         let State::Following(following) = &mut self.state else {
             return;

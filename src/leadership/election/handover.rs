@@ -109,6 +109,11 @@ impl Election {
     /// Records a round that this node published or accepted. A follower takes it as a sign of life
     /// of the leader. A leader with a ready challenger holds the next round; if this one was held
     /// already, it yields now, because almost a whole period remains.
+    ///
+    /// # Example
+    /// `gauss` hands over to `edge`, whose `Ready` arrived in round 88. Round 88 ends: round 89 is
+    /// held to its full length. Round 89 ends: `gauss` sends `Yield { last_round: 89 }`, and `edge`
+    /// publishes round 90.
     pub(super) fn record_round(&mut self, epoch: &Epoch, round: u64, now: Timestamp) {
         if epoch.term <= self.term_limit(Role::Auto, now) {
             self.observe_term(epoch.term);
@@ -143,6 +148,11 @@ impl Election {
     /// ([`ElectionEffect::Prepare`]); when the preparation is complete, every further offer is
     /// answered with `Ready`, because an earlier answer may have been lost. Offers of a node that
     /// is not the followed leader are ignored.
+    ///
+    /// # Example
+    /// `gauss` offers, and this node prepares. An offer during the preparation is left unanswered.
+    /// The preparation completes, and `prepared` sends `Ready`. That message is lost: the next
+    /// offer is answered with `Ready` again.
     pub(super) fn on_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
         let may_lead = self.candidacy().may_lead();
         let State::Following(following) = &mut self.state else {
@@ -165,6 +175,8 @@ impl Election {
         }
     }
 
+    /// Handles the caller's report that the preparation is complete: sends `Ready` to the leader.
+    /// Without an offer of the current leader the report has no effect.
     pub(super) fn prepared(&mut self, now: Timestamp) {
         if let State::Following(following) = &mut self.state
             && following.offered_at.is_some()

@@ -107,6 +107,9 @@ impl Leading {
 }
 
 impl Election {
+    /// Runs the timers of a leader: drives a handover; when beats are due, renews the term if a
+    /// peer still refuses it, or updates the successors, looks for a better candidate and sends the
+    /// beats of this turn. The standby gets every beat, other peers get theirs in different turns.
     pub(super) fn lead_timers(&mut self, now: Timestamp) {
         self.drive_handover(now);
         let next = now + self.config.beat();
@@ -174,12 +177,15 @@ impl Election {
         }
     }
 
+    /// Sends a beat to every peer, because epoch or successors changed.
     pub(super) fn beat_all(&mut self, now: Timestamp) {
         for peer in self.peers.names().cloned().collect::<Vec<_>>() {
             self.send_beat(&peer, now);
         }
     }
 
+    /// Sends one beat to a peer, with the interval that applies to it; without effect while this
+    /// node does not lead.
     pub(super) fn send_beat(&mut self, to: &NodeName, now: Timestamp) {
         let State::Leading(leading) = &self.state else {
             return;

@@ -88,6 +88,8 @@ impl Election {
             .map_or(seeking.ask_at, |claim_at| claim_at.min(seeking.ask_at))
     }
 
+    /// Runs the timers of a node without a leader: claims leadership when its turn has come, and
+    /// until then repeats its question to all nodes.
     pub(super) fn seek_timers(&mut self, now: Timestamp) {
         let State::Seeking(seeking) = &self.state else {
             return;
@@ -122,6 +124,7 @@ impl Election {
         });
     }
 
+    /// Sends `Ask` to all peers, under one new number.
     pub(super) fn ask_all(&mut self, now: Timestamp) {
         let ask = self.questions.ask_for_itself(now);
         self.send_all(&Body::Ask { ask }, now);

@@ -221,6 +221,17 @@ impl SuccessionFilter {
         Ok(())
     }
 
+    /// Handles a round of a node other than the `elected` leader. A higher epoch is admitted if it
+    /// continues the elected leader's rounds, as its standby or that leader in a later term does,
+    /// or if that leader has been silent for [`ELECTED_SILENCE`]. It is refused once other nodes
+    /// have used up their credit. A lower epoch is admitted in order: these are the last rounds of
+    /// the previous leader.
+    ///
+    /// # Example
+    /// `edge` is elected in term 4 with the standby `gauss`, and its round 88 was admitted. Round
+    /// 89 of `gauss` in term 5 arrives before the election names `gauss`: it is admitted. Round 89
+    /// of `euclid` in term 6 is refused as [`Refusal::NotElected`] until `edge` has been silent for
+    /// [`ELECTED_SILENCE`].
     fn admit_other(
         &mut self,
         epoch: &Epoch,

@@ -189,6 +189,8 @@ impl VehicleBelief {
 }
 
 impl Belief {
+    /// Counts one frame that had the place in view: a hit with an object, a miss without; labels
+    /// whose evidence is used up are dropped.
     fn update(
         &mut self,
         found: Option<&PerceivedObject>,
@@ -202,6 +204,8 @@ impl Belief {
         self.labels.retain(|evidence| evidence.nats > 0.0);
     }
 
+    /// Counts a detection: evidence for its label, against all other labels, and for the presence
+    /// of any object, each within `evidence_limit`.
     fn hit(&mut self, object: &PerceivedObject, increments: Increments, config: &PaceConfig) {
         let nats = increments.hit_nats * object.confidence;
         let mut is_known = false;
@@ -224,6 +228,8 @@ impl Belief {
         ));
     }
 
+    /// Counts a frame without a detection: evidence against every label, and against any object
+    /// within `absence_limit`.
     fn miss(&mut self, increments: Increments, config: &PaceConfig) {
         for evidence in &mut self.labels {
             evidence.nats -= increments.miss_nats;

@@ -79,6 +79,8 @@ impl WeightedVoting {
         }
     }
 
+    /// Adds the labels of the ledger's votes to the cell, the most useful labels first, as far as
+    /// there is room.
     fn take_over_labels(&mut self, known: &[(NodeName, RememberedVotes)], max_labels: usize) {
         let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
