@@ -25,11 +25,11 @@ use crate::node::running::{RunningNode, RunningReadiness};
 pub struct Finding {
     /// Name of the check.
     pub check: &'static str,
-    /// Outcome.
+    /// Outcome of the check.
     pub verdict: CheckResult,
-    /// Observation.
+    /// Observation that led to the outcome.
     pub seen: String,
-    /// Suggested fix.
+    /// Suggested fix; `None` if the check found no problem.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fix: Option<String>,
 }
@@ -38,7 +38,7 @@ pub struct Finding {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CheckResult {
-    /// No problem.
+    /// The check found no problem.
     Fine,
     /// The node runs, but with a limitation.
     Doubtful,

@@ -78,12 +78,12 @@ pub enum NodeMessage {
     LogHealth,
     /// Report the state of the node to the service manager from now on.
     ReportTo {
-        /// The manager.
+        /// Service manager that started the node.
         manager: ServiceManager,
     },
     /// Use this description of the cell.
     Describe {
-        /// The description.
+        /// The description to use from now on.
         description: Arc<CellDescription>,
     },
     /// Record the readiness of the node.
@@ -93,7 +93,7 @@ pub enum NodeMessage {
     },
     /// Change the functions of this node for the vehicle, which moves from cell to cell.
     Move {
-        /// The change.
+        /// Step by which the node enters or leaves its cell.
         step: MoveStep,
         /// Answered when the change is done.
         done: RpcReplyPort<()>,
@@ -104,7 +104,6 @@ pub enum NodeMessage {
 #[derive(Debug, Default)]
 struct Supervisor;
 
-/// The running parts.
 struct SupervisorState {
     builder: NodeBuilder,
     running: HashMap<ActorId, ActorKind>,
@@ -126,12 +125,12 @@ pub enum NodeError {
     NameTaken {
         /// The name of both.
         name: NodeName,
-        /// Their cell.
+        /// Name of the cell of both.
         cell: NodeName,
     },
 }
 
-/// A running node.
+/// Handle of a running node, through which it is observed and stopped.
 pub struct NodeHandle {
     supervisor: ActorRef<NodeMessage>,
     ended: JoinHandle<()>,
@@ -286,7 +285,7 @@ impl NodeHandle {
         &self.slots
     }
 
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub fn counters(&self) -> &Arc<Counters> {
         &self.counters
     }

@@ -31,29 +31,29 @@ const HISTORY: usize = 5;
 /// State of a cell at one moment.
 #[derive(Debug)]
 pub struct CellView {
-    /// The cell's name.
+    /// Name of the observed cell.
     pub cell: NodeName,
     /// Age from which the newest round counts as stale, if rounds are periodic.
     pub patience: Option<Duration>,
-    /// The current time.
+    /// Time of this state by the observer's clock.
     pub now: Timestamp,
-    /// The leadership.
+    /// Leadership of the cell as the observer sees it.
     pub leadership: Leadership,
     /// Leaderships by their first round, and the time of that round; newest last.
     pub history: VecDeque<(Epoch, Timestamp)>,
-    /// The other nodes.
+    /// All living nodes except the observer.
     pub members: Vec<Member>,
-    /// The newest map.
+    /// Newest accepted map; `None` before the first.
     pub map: Option<ReceivedMap>,
-    /// The newest verdicts.
+    /// Newest accepted verdicts; `None` before the first.
     pub verdicts: Option<Received<Verdicts>>,
-    /// The newest reputations.
+    /// Newest accepted reputations; `None` before the first.
     pub reputations: Option<Received<Reputations>>,
     /// Current troubles of the cell, with the node that reports each.
     pub troubles: Vec<(Option<NodeName>, Trouble)>,
     /// How vehicles begin to report, for a cell without reports.
     pub guide: String,
-    /// The observer's counters.
+    /// Counters of the observer at this time.
     pub counters: CounterSnapshot,
     /// Number of lines above the first visible one.
     pub scroll: usize,

@@ -277,7 +277,7 @@ impl Sleepers {
         }
     }
 
-    /// Ends them.
+    /// Ends the sleepers and returns the times at which they overslept.
     fn wake(self) -> StoodStill {
         self.wanted.store(false, Ordering::Relaxed);
         StoodStill(

@@ -43,7 +43,7 @@ pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
 
 /// Parts and values that a keeper needs at its start.
 pub struct DescriptionKeeperArguments {
-    /// The node's name.
+    /// Name of this node, which descriptions that are set here state as their author.
     pub name: NodeName,
     /// True if it may lead, and so set and publish descriptions.
     pub may_lead: bool,
@@ -55,17 +55,18 @@ pub struct DescriptionKeeperArguments {
     pub credentials: Option<Arc<Credentials>>,
     /// Makes the node use a description.
     pub apply: DescriptionSink,
-    /// The other nodes.
+    /// All living nodes except this one.
     pub members: watch::Receiver<Vec<Member>>,
     /// The leader, as it changes.
     pub leadership: watch::Receiver<Leadership>,
-    /// Publishes descriptions.
+    /// Publishes descriptions, retained, on all links.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
 }
 
-/// Keeps the description.
+/// Actor that keeps the description of the cell: it exchanges descriptions with other nodes, saves
+/// the current one and makes the node use it.
 #[derive(Debug, Default)]
 pub struct DescriptionKeeper;
 

@@ -42,7 +42,7 @@ pub struct DetectorArguments {
     pub open: Opener,
     /// Stall timeout and retries of the source.
     pub capture: CaptureConfig,
-    /// The detection algorithm.
+    /// The detection algorithm, which runs outside the async threads.
     pub detect: Box<dyn Detect>,
     /// The camera's lens. Detections are scaled to the image size of this lens.
     pub lens: Lens,

@@ -45,7 +45,7 @@ pub struct FollowerArguments {
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
-    /// The node's cell.
+    /// Name of the cell whose rounds are accepted.
     pub cell: NodeName,
     /// The cell in which the vehicle is present: maps of other cells are not logged.
     pub present_cell: watch::Receiver<NodeName>,
@@ -61,11 +61,11 @@ pub struct FollowerArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// Forwards all accepted messages to local programs.
     pub door: Door,
-    /// The cell's time.
+    /// The cell's time, shared by the node's actors.
     pub clock: CellClock,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
-    /// The node's spans.
+    /// Tracing spans of the node, shared by its actors.
     pub spans: Spans,
 }
 

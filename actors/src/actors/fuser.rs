@@ -54,15 +54,15 @@ pub struct FuserArguments {
     pub newest: Option<(Arc<GlobalMap>, Timestamp)>,
     /// Records the aggregator's inputs.
     pub recording: LogSender,
-    /// The cell's time.
+    /// The cell's time, in which rounds are dated.
     pub clock: CellClock,
     /// Where maps and verdicts are published.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Receives the evidence of rounds about vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
-    /// The node's spans.
+    /// Tracing spans of the node, shared by its actors.
     pub spans: Spans,
 }
 

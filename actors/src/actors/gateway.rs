@@ -49,7 +49,7 @@ use crate::transport::mqtt::{
 
 /// Arguments of a [`Gateway`].
 pub struct GatewayArguments {
-    /// The cell's name.
+    /// Name of the cell whose topics are used.
     pub cell: NodeName,
     /// Topics to subscribe to.
     pub role: SubscriptionRole,
@@ -57,11 +57,11 @@ pub struct GatewayArguments {
     pub status: NodeStatus,
     /// Protocol, credentials and limits.
     pub mqtt: MqttConfig,
-    /// Certificates and signatures.
+    /// Certificates for connections, and the signatures of rounds.
     pub security: Security,
-    /// The cell's time.
+    /// The cell's time, shared by the node's actors.
     pub clock: CellClock,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
     /// Callback for every message.
     pub subscriber: Subscriber,

@@ -54,11 +54,11 @@ use crate::transport::pki::Credentials;
 pub struct Parts {
     /// Sends messages to other nodes.
     pub membership: ActorSlot<MembershipMessage>,
-    /// Keeps the links.
+    /// Keeps the links, and publishes the node's status on them.
     pub gateway: ActorSlot<GatewayMessage>,
     /// Makes maps and verdicts.
     pub fuser: ActorSlot<FuserMessage>,
-    /// Holds the reputations.
+    /// Shares the evidence behind the reputations with other candidates.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// Keeps the cell's description.
     pub description: ActorSlot<DescriptionKeeperMessage>,
@@ -84,7 +84,7 @@ pub struct LeaderElectionArguments {
     pub own_broker: watch::Receiver<Option<SocketAddr>>,
     /// Address at which the node's page listens.
     pub page: watch::Receiver<Option<SocketAddr>>,
-    /// The other nodes.
+    /// All living nodes except this one.
     pub members: watch::Receiver<Vec<Member>>,
     /// The parts it commands.
     pub parts: Parts,
@@ -95,9 +95,10 @@ pub struct LeaderElectionArguments {
     pub clock: CellClock,
     /// Name of the cell.
     pub cell: NodeName,
-    /// The node's certificates.
+    /// Certificates of the node, which sign its signs of life; `None` in a cell without
+    /// certificates.
     pub credentials: Option<Arc<Credentials>>,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
     /// The expected nodes of the cell.
     pub live_state: Arc<LiveState>,
@@ -105,7 +106,8 @@ pub struct LeaderElectionArguments {
     pub is_visitor: bool,
 }
 
-/// Drives a [`LeadershipNode`](ecod::leadership::node::LeadershipNode).
+/// Actor that drives a [`LeadershipNode`](ecod::leadership::node::LeadershipNode): it passes events
+/// and time to it, and carries out its effects.
 #[derive(Debug, Default)]
 pub struct LeaderElection;
 

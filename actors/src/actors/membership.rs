@@ -42,7 +42,7 @@ use renewal::{RenewalStep, Renewals};
 
 /// Arguments of a [`Membership`].
 pub struct MembershipArguments {
-    /// The node's name.
+    /// Name of this node, unique in its cell.
     pub name: NodeName,
     /// The cell. Nodes of other cells are ignored.
     pub cell: NodeName,

@@ -35,7 +35,7 @@ use crate::telemetry::counters::{Counters, Event};
 
 /// Arguments of a projector's start.
 pub struct ProjectorArguments {
-    /// Camera and landmarks.
+    /// Projection of the camera, and the landmarks of its cell.
     pub perception: Perception,
     /// The pose of a vehicle that stands still, if available.
     pub standing: Option<Pose>,
@@ -49,7 +49,7 @@ pub struct ProjectorArguments {
     pub is_fixed: bool,
     /// Algorithms to report for.
     pub algorithms: Algorithms,
-    /// Dates the reports.
+    /// The cell's time, in which reports state their capture.
     pub clock: CellClock,
     /// Publisher of the reports.
     pub gateway: ActorSlot<GatewayMessage>,

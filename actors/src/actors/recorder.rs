@@ -35,7 +35,7 @@ pub struct RecorderArguments {
     pub identity: LogIdentity,
     /// Sender that the node's parts share.
     pub recording: LogSender,
-    /// The leadership.
+    /// Leadership of the node, of which every change is recorded.
     pub leadership: watch::Receiver<Leadership>,
     /// Counters of the node.
     pub counters: Arc<Counters>,

@@ -58,13 +58,13 @@ use store::Saved;
 
 /// Arguments of a keeper's start.
 pub struct ReputationKeeperArguments {
-    /// The node's name.
+    /// Name of this node, under which it shares evidence.
     pub name: NodeName,
-    /// The cell's name.
+    /// Name of the cell, which the signatures of evidence contain.
     pub cell: NodeName,
     /// Rules by which evidence becomes reputations.
     pub reputation: ReputationConfig,
-    /// Its rhythm.
+    /// Periods at which reputations are published, saved and shared.
     pub config: ReputationKeeperConfig,
     /// Evidence of earlier runs of the actor, shared with the code that starts a fuser.
     pub reputations: SharedReputations,
@@ -74,7 +74,7 @@ pub struct ReputationKeeperArguments {
     pub credentials: Option<Arc<Credentials>>,
     /// The newest reputations of the cell.
     pub newest: watch::Receiver<Option<Received<Reputations>>>,
-    /// The other nodes.
+    /// All living nodes except this one.
     pub members: watch::Receiver<Vec<Member>>,
     /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
@@ -86,11 +86,12 @@ pub struct ReputationKeeperArguments {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// The cell's time, used for checking resets.
     pub clock: CellClock,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
 }
 
-/// Keeps the ledger.
+/// Actor that keeps the ledger: it records the evidence of rounds, merges the shares of other
+/// candidates, and publishes and saves the result.
 #[derive(Debug, Default)]
 pub struct ReputationKeeper;
 

@@ -50,13 +50,13 @@ use crate::transport::mqtt::{BrokerAddress, FromRegion, MqttConfig, Security};
 
 /// Arguments of an uplink's start.
 pub struct UplinkArguments {
-    /// The cell's name.
+    /// Name of the cell in the region.
     pub cell: NodeName,
     /// First status of the node. It holds the name and the id of this run.
     pub status: NodeStatus,
-    /// The region's broker.
+    /// Address of the region's broker.
     pub broker: BrokerAddress,
-    /// Rate of maps.
+    /// Settings of the uplink, from which the rate of maps is used.
     pub config: UplinkConfig,
     /// Settings of the cell's own connections, for their limits.
     pub mqtt: MqttConfig,
@@ -68,11 +68,11 @@ pub struct UplinkArguments {
     pub description: Option<Arc<CellDescription>>,
     /// The newest map of the cell.
     pub newest: watch::Receiver<Option<ReceivedMap>>,
-    /// The current leadership.
+    /// Leadership of the node, which is connected only while it leads.
     pub leadership: watch::Receiver<Leadership>,
     /// Receives the objects of neighbours.
     pub fuser: ActorSlot<FuserMessage>,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
     /// Seed of the jitter between connection attempts.
     pub seed: u64,

@@ -34,7 +34,7 @@ const PLAUSIBLE_FOV_DEG: RangeInclusive<f64> = 0.2..=175.0;
 /// Places of the principal point, in shares of the image.
 const PLAUSIBLE_MIDDLE: RangeInclusive<f64> = 0.02..=0.98;
 
-/// A printed chessboard.
+/// A printed chessboard, whose inner corners are found in photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chessboard {
     /// Inner corners along a row: squares minus one.
@@ -66,14 +66,14 @@ pub struct Calibration {
     /// Root mean square distance in pixels between found and reprojected corners; good is below
     /// 0.5.
     pub rms_px: f64,
-    /// Photographs used.
+    /// Paths of the photographs in which the whole board was found.
     pub images: Vec<PathBuf>,
 }
 
 /// The result of [`calibrate`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct CalibrationReport {
-    /// The calibrated camera.
+    /// Optics of the camera, as the calibration file contains them.
     pub calibration: Calibration,
     /// Photographs in which the whole board was not found.
     pub without_board: Vec<PathBuf>,
@@ -92,9 +92,9 @@ pub enum CalibrationError {
     /// The photographs have different sizes.
     #[error("image {path:?} is {size}, the others are {expected}")]
     SizeDiffers {
-        /// The image.
+        /// Path of the image.
         path: PathBuf,
-        /// Its size.
+        /// Size of this image.
         size: ImageSize,
         /// Size of the first image.
         expected: ImageSize,
@@ -106,7 +106,7 @@ pub enum CalibrationError {
     TooFewViews {
         /// Number of photographs with the board.
         found: usize,
-        /// Photographs without.
+        /// Paths of the photographs in which the board was not found.
         without_board: Vec<PathBuf>,
     },
     /// OpenCV failed on an image or in a step.

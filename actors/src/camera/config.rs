@@ -24,7 +24,7 @@ pub struct CameraConfig {
     /// such as `euclid--rear`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Source of frames.
+    /// Source of the camera's frames: a device, a stream or files.
     pub source: SourceConfig,
     /// Stall timeout and retries of the source.
     #[serde(default)]

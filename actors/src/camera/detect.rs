@@ -39,15 +39,15 @@ pub enum DetectError {
     UnusableImage {
         /// The frame's sequence number.
         seq: u64,
-        /// Its content instead.
+        /// Description of the pixels that the frame has.
         found: String,
     },
     /// OpenCV refused an operation.
     #[error("opencv failed in {step}")]
     OpenCv {
-        /// The step.
+        /// Name of the operation that failed.
         step: &'static str,
-        /// OpenCV's error.
+        /// The error that OpenCV returned.
         #[source]
         source: opencv::Error,
     },
@@ -59,9 +59,9 @@ pub enum DetectError {
         "the model found class {class}, but there are {labels} labels: list all of its classes in `labels`"
     )]
     UnknownClass {
-        /// The class's number.
+        /// Number of the class in the model.
         class: usize,
-        /// Count of labels.
+        /// Number of the labels that are configured.
         labels: usize,
     },
     /// The model's outputs do not match its family.
@@ -71,7 +71,7 @@ pub enum DetectError {
     Contradiction {
         /// The family in use.
         family: String,
-        /// The contradiction.
+        /// The contradiction as a phrase.
         what: String,
     },
     /// The decoder refused the image.

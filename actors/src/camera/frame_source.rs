@@ -64,7 +64,7 @@ pub enum FrameError {
     /// A file or sequence ended.
     #[error("{origin} ended")]
     Ended {
-        /// Its path.
+        /// Path of the file or sequence.
         origin: String,
     },
 }
@@ -116,7 +116,7 @@ pub enum SourceConfig {
         /// The pipeline as for `gst-launch-1.0`; BGR, with `appsink drop=true max-buffers=1`.
         pipeline: String,
     },
-    /// A network camera.
+    /// A network camera, which is read by its address.
     Url {
         /// Its `rtsp://` or `http://` address.
         url: String,

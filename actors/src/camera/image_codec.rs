@@ -32,7 +32,7 @@ pub enum ImageError {
     /// The image has no pixels.
     #[error("cannot encode as JPEG")]
     Encoding(#[from] EncodingError),
-    /// OpenCV failed.
+    /// OpenCV failed in a step of the conversion.
     #[error("opencv failed on an image")]
     OpenCv(#[from] opencv::Error),
 }

@@ -9,9 +9,9 @@ use opencv::core::{Mat, MatTraitConst};
 /// Width and height in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageSize {
-    /// Columns.
+    /// Number of pixel columns.
     pub width: u32,
-    /// Rows.
+    /// Number of pixel rows.
     pub height: u32,
 }
 
@@ -22,7 +22,7 @@ pub struct ImageSize {
      change the source, or set or calibrate the optics for {frame}"
 )]
 pub struct SizeMismatch {
-    /// The frame's size.
+    /// Size of the refused frame.
     pub frame: ImageSize,
     /// The size of the optics.
     pub optics: ImageSize,

@@ -7,7 +7,7 @@ use nalgebra::Point2;
 
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 
-/// A calibrated camera.
+/// Optics of a camera: its intrinsics and the distortion of its lens.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
     /// Focal lengths and principal point, in pixels.

@@ -24,13 +24,13 @@ use crate::camera::lens::Lens;
 /// A vehicle's camera and the landmarks of its cell.
 #[derive(Debug, Clone)]
 pub struct VehicleCamera {
-    /// The vehicle's name.
+    /// Name of the vehicle or part that reports.
     pub node: NodeName,
-    /// The vehicle's pose.
+    /// Pose of the vehicle in the cell's frame.
     pub pose: Pose,
     /// Position of the camera on the vehicle.
     pub mount: Mount,
-    /// The calibrated camera.
+    /// Intrinsics and distortion of the camera.
     pub lens: Lens,
     /// Landmarks of the cell.
     pub landmarks: Arc<LandmarkIndex>,

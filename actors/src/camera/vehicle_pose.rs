@@ -114,7 +114,7 @@ impl PoseConfig {
         self.moving == Some(false)
     }
 
-    /// The constant pose.
+    /// The configured pose, in the frame in which it is stated.
     pub fn stated(&self) -> StatedPose {
         match (self.latitude_deg, self.longitude_deg, self.azimuth_deg) {
             (Some(latitude_deg), Some(longitude_deg), Some(azimuth_deg)) => {

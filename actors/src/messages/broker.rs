@@ -23,7 +23,7 @@ pub enum BrokerMessage {
     },
     /// Query the state of the broker.
     Health {
-        /// Gets the state.
+        /// Gets the state of the broker.
         reply: RpcReplyPort<BrokerHealth>,
     },
 }

@@ -9,7 +9,7 @@ use crate::camera::frame::CameraFrame;
 pub enum DetectorMessage {
     /// Find the objects in a frame.
     Detect {
-        /// The frame.
+        /// The frame in which to find objects.
         frame: CameraFrame,
         /// Admits the next frame when dropped.
         permit: OwnedSemaphorePermit,

@@ -9,17 +9,17 @@ use crate::transport::mqtt::Delivery;
 /// A message from the cell's leader; the follower accepts or refuses it.
 #[derive(Debug)]
 pub enum FollowerMessage {
-    /// A map.
+    /// A map of a closed round.
     TakeMap {
         /// The map and its time of receipt.
         delivery: Delivery<Arc<GlobalMap>>,
     },
-    /// Verdicts.
+    /// Verdicts of a closed round.
     TakeVerdicts {
         /// The verdicts and their time of receipt.
         delivery: Delivery<Arc<Verdicts>>,
     },
-    /// Reputations.
+    /// Reputations, possibly retained by a broker.
     TakeReputations {
         /// The reputations and their time of receipt.
         delivery: Delivery<Arc<Reputations>>,

@@ -23,15 +23,15 @@ pub enum FuserMessage {
     /// Keep another aggregator's map, which the follower accepted, to continue from it when
     /// leading.
     TakeMap {
-        /// The map.
+        /// The map as the follower accepted it.
         map: Arc<GlobalMap>,
-        /// Time of receipt.
+        /// Time of receipt by this node's clock.
         received_at: Timestamp,
     },
     /// Do not continue from a map of this node, and remove objects that it alone has reported: its
     /// certificate was revoked or has expired.
     Expel {
-        /// The node.
+        /// Name of the node whose certificate is invalid.
         node: NodeName,
     },
     /// Show these objects of other cells, and take over their identities.
@@ -45,7 +45,7 @@ pub enum FuserMessage {
     CloseRound,
     /// Publish from now on.
     Lead {
-        /// The leadership.
+        /// Epoch of the node's own leadership.
         epoch: Epoch,
         /// Number of the next round.
         first_round: u64,
@@ -59,19 +59,19 @@ pub enum FuserMessage {
     StopPublishing,
     /// Continue with other settings.
     Configure {
-        /// Settings of fusion.
+        /// Settings of the fusion, which must be valid.
         fusion: Box<FusionConfig>,
-        /// The cell's landmarks.
+        /// All landmarks of the cell.
         landmarks: Vec<LandmarkConfig>,
     },
     /// Start from evidence of another source.
     Adopt {
-        /// All available evidence.
+        /// All evidence that the node has.
         ledger: Arc<ReputationLedger>,
     },
     /// Continue, in VOTE's `paper` mode, from published reputations.
     Resume {
-        /// The reputations.
+        /// Reputations by the name of the vehicle.
         reputations: BTreeMap<NodeName, Reputation>,
     },
     /// Query whether the reports of vehicles are usable by their time.

@@ -35,44 +35,44 @@ pub enum GatewayMessage {
     },
     /// Replace the subscriber, such as after a receiver's restart.
     SetSubscriber {
-        /// The new subscriber.
+        /// Callback for every later message.
         subscriber: Subscriber,
     },
     /// Publish this vehicle's report, also in-process.
     PublishReport {
         /// The kind of evidence.
         kind: ReportKind,
-        /// The report.
+        /// The report, with its capture in the cell's time.
         report: Arc<ObjectReport>,
     },
     /// Publish the map of a round, also in-process.
     PublishMap {
-        /// The map.
+        /// The map that the node's fuser made.
         map: Arc<GlobalMap>,
     },
     /// Publish the verdicts of a round, also in-process.
     PublishVerdicts {
-        /// The verdicts.
+        /// The verdicts that the node's fuser made.
         verdicts: Arc<Verdicts>,
     },
     /// Publish reputations, retained, also in-process.
     PublishReputations {
-        /// The reputations.
+        /// The reputations of all vehicles.
         reputations: Arc<Reputations>,
     },
     /// Publish the cell's description, retained.
     PublishDescription {
-        /// The description.
+        /// The description that the node uses.
         description: Arc<CellDescription>,
     },
     /// Publish evidence to the other candidates.
     PublishShare {
-        /// The evidence.
+        /// The share, signed in a cell with certificates.
         share: LedgerShare,
     },
     /// Replace this node's status, now and on every later connection.
     PublishStatus {
-        /// The status.
+        /// The complete status of this node.
         status: NodeStatus,
     },
     /// Query the state of every link.
@@ -82,7 +82,7 @@ pub enum GatewayMessage {
     },
     /// An event of a link's own task.
     LinkChanged {
-        /// The event.
+        /// The event, with the link that reports it.
         event: LinkEvent,
     },
 }

@@ -13,7 +13,7 @@ use crate::transport::mqtt::Delivery;
 pub enum LeaderElectionMessage {
     /// The membership detected a change, or received a message.
     Membership {
-        /// The news.
+        /// The change, or the received message.
         event: MembershipEvent,
     },
     /// A broker forwarded a status.
@@ -23,7 +23,7 @@ pub enum LeaderElectionMessage {
     },
     /// Something else happened at the node.
     Note {
-        /// The news.
+        /// Input of the state machine of the leadership.
         input: Input,
     },
 }

@@ -11,7 +11,7 @@ use ractor::RpcReplyPort;
 pub enum RenewalOutcome {
     /// This node has decided about another node's request.
     Answered {
-        /// The other node.
+        /// Node that sent the request.
         to: NodeName,
         /// Its request, by which a repeated one is recognised.
         request: Vec<u8>,
@@ -27,19 +27,19 @@ pub enum RenewalOutcome {
 pub enum MembershipMessage {
     /// Send a datagram to a node, once and without waiting; it may be lost.
     Send {
-        /// The addressee.
+        /// Node to which the datagram goes.
         to: NodeName,
-        /// At most [`crate::transport::gossip::MAX_PAYLOAD_BYTES`].
+        /// Payload of at most [`crate::transport::gossip::MAX_PAYLOAD_BYTES`].
         payload: Bytes,
     },
     /// Query the bound address, which may be unspecified.
     Address {
-        /// Gets the answer.
+        /// Gets the bound address.
         reply: RpcReplyPort<SocketAddr>,
     },
     /// Greet these addresses; sent by the membership to itself.
     SetSeeds {
-        /// The seeds, resolved.
+        /// Resolved addresses of all seeds.
         addresses: Vec<SocketAddr>,
     },
     /// Read changed certificates, and end sessions with an expired or revoked certificate; sent by
@@ -49,7 +49,7 @@ pub enum MembershipMessage {
     CheckAddress,
     /// A renewal of a certificate was decided; sent by the membership to itself.
     Renewal {
-        /// The decision.
+        /// Result of the step of the renewal.
         outcome: RenewalOutcome,
     },
     /// Process waiting datagrams and due timers; sent by the membership to itself.

@@ -13,18 +13,18 @@ pub struct Received<T> {
     /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
-    /// The message.
+    /// The message as it was accepted.
     pub message: Arc<T>,
 }
 
 /// Watches of the newest messages of each kind.
 #[derive(Debug, Clone)]
 pub struct Newest {
-    /// The newest map.
+    /// Newest accepted map; `None` before the first.
     pub map: watch::Sender<Option<ReceivedMap>>,
-    /// The newest verdicts.
+    /// Newest accepted verdicts; `None` before the first.
     pub verdicts: watch::Sender<Option<Received<Verdicts>>>,
-    /// The newest reputations.
+    /// Newest accepted reputations; `None` before the first.
     pub reputations: watch::Sender<Option<Received<Reputations>>>,
 }
 
@@ -46,6 +46,6 @@ pub struct ReceivedMap {
     /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
-    /// The map.
+    /// The map as it was accepted.
     pub map: Arc<GlobalMap>,
 }

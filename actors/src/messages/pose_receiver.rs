@@ -10,7 +10,7 @@ pub enum PoseReceiverMessage {
     Take {
         /// Time of the pose by the clock that stamps frames.
         at: Timestamp,
-        /// The pose.
+        /// Pose of the vehicle at that time.
         pose: StatedPose,
     },
 }

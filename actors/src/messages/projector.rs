@@ -15,18 +15,18 @@ use crate::camera::perception::Perception;
 pub enum ProjectorMessage {
     /// Place the detections of one frame in the world and report them.
     Report {
-        /// Detections in pixels.
+        /// Detections of the frame, in pixels.
         detections: Vec<Detection>,
         /// Lens of the frame.
         lens: Lens,
-        /// Time of capture.
+        /// Time of capture by the clock that stamps frames.
         captured_at: Timestamp,
         /// The frame, if browsers are to see it.
         shown: Option<CameraFrame>,
     },
     /// Continue with other settings.
     Configure {
-        /// Camera and landmarks.
+        /// Projection of the camera, and the landmarks of its cell.
         perception: Box<Perception>,
         /// The pose of a vehicle that stands still, if available.
         standing: Option<Pose>,

@@ -15,27 +15,27 @@ use crate::transport::mqtt::Delivery;
 pub enum ReputationKeeperMessage {
     /// Publish in the node's own leadership from now on.
     Lead {
-        /// The leadership.
+        /// Epoch of the node's own leadership.
         epoch: Epoch,
         /// Number of the last round before it.
         last_round: u64,
     },
     /// Record the evidence about vehicles from a round of the node's own leadership.
     Record {
-        /// The leadership.
+        /// Epoch of the leadership that closed the round.
         epoch: Epoch,
-        /// The round.
+        /// Number of the round.
         round: u64,
         /// Votes that were settled by it.
         evidence: Vec<Evidence>,
         /// In VOTE's `paper` mode, the reputations after it.
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     },
-    /// Stop publishing.
+    /// Stop publishing, because the leadership has ended.
     StepDown,
     /// Continue with other parameters of reputations.
     Configure {
-        /// The parameters.
+        /// Parameters by which evidence becomes reputations.
         reputation: ReputationConfig,
     },
     /// Merge another candidate's evidence.

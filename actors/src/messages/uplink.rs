@@ -16,7 +16,7 @@ pub enum UplinkMessage {
     Reconnect,
     /// Publish this status of the node while it leads.
     SetStatus {
-        /// The status.
+        /// The complete status of this node.
         status: NodeStatus,
     },
     /// Continue with other settings of the cell.
@@ -33,7 +33,7 @@ pub enum UplinkMessage {
     },
     /// An event of the link's own task.
     LinkChanged {
-        /// The event.
+        /// The event that the link reports.
         event: LinkEvent,
     },
 }

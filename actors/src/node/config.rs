@@ -82,7 +82,7 @@ pub struct NodeConfig {
     pub membership: MembershipConfig,
     /// Election of the leader.
     pub election: ElectionConfig,
-    /// MQTT connections.
+    /// Settings of the node's MQTT connections.
     pub mqtt: MqttConfig,
     /// The node's certificates. Default: not set; connections to brokers are in plaintext.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -459,7 +459,7 @@ impl NodeConfig {
         DataPlane { external, embedded }
     }
 
-    /// The cell's landmarks.
+    /// Landmarks of the cell, in the form that the algorithms use.
     pub fn landmarks(&self) -> Vec<Landmark> {
         self.landmarks.iter().map(Landmark::from).collect()
     }

@@ -16,7 +16,7 @@ use crate::observe::http::{PageError, read_page};
 pub struct RunningNode {
     /// Time of the answer, in Unix microseconds by the node's clock.
     pub now_us: Timestamp,
-    /// The node.
+    /// Name, cell and role of the node.
     pub node: RunningIdentity,
     /// Whether the node is ready.
     pub readiness: RunningReadiness,
@@ -31,11 +31,11 @@ pub struct RunningNode {
 /// Name, cell and role of a running node.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunningIdentity {
-    /// Its name.
+    /// Name of the running node.
     pub name: NodeName,
     /// Name of its cell.
     pub cell: NodeName,
-    /// Its role.
+    /// Role with which the node was started.
     pub role: Role,
     /// Version of its software.
     pub version: String,
@@ -61,9 +61,9 @@ pub struct RunningReadiness {
 pub struct RunningLeadership {
     /// The node's position: `seeking`, `following`, `standing_by` or `leading`.
     pub position: String,
-    /// The leader.
+    /// Name of the leader; `None` while the node seeks one.
     pub leader: Option<NodeName>,
-    /// The highest term.
+    /// Highest term that has been seen.
     pub epoch: Option<u64>,
     /// The node that leads next.
     pub standby: Option<NodeName>,
@@ -72,9 +72,9 @@ pub struct RunningLeadership {
 /// A node of the cell as a running node sees it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunningMember {
-    /// Its name.
+    /// Name of the node in its cell.
     pub name: NodeName,
-    /// Its role.
+    /// Role with which the node was started.
     pub role: Role,
     /// True if it answers.
     pub alive: bool,
@@ -88,9 +88,9 @@ pub struct RunningMember {
 /// A trouble, and the node that reports it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunningTrouble {
-    /// The reporting node.
+    /// Name of the node that reports the trouble.
     pub told_by: NodeName,
-    /// The trouble.
+    /// The trouble as that node reports it.
     #[serde(flatten)]
     pub trouble: Trouble,
 }

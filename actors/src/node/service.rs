@@ -46,7 +46,7 @@ impl ServiceManager {
         })
     }
 
-    /// All parts run.
+    /// Notifies the manager that all parts of the node run.
     pub fn started(&mut self) {
         self.tell(&[NotifyState::Ready]);
     }
@@ -62,7 +62,7 @@ impl ServiceManager {
         }
     }
 
-    /// The node ends.
+    /// Notifies the manager that the node is about to end.
     pub fn stopping(&mut self) {
         self.tell(&[NotifyState::Stopping]);
     }

@@ -24,13 +24,13 @@ use crate::messages::uplink::UplinkMessage;
 pub enum ActorKind {
     /// The writer of the log.
     Recorder,
-    /// The embedded broker.
+    /// The embedded MQTT broker of the node.
     Broker,
     /// The gossip with the other nodes.
     Membership,
     /// The keeper of the cell's description.
     DescriptionKeeper,
-    /// The MQTT connections.
+    /// The owner of the cell's MQTT connections.
     Gateway,
     /// The taker of maps.
     Follower,
@@ -40,9 +40,9 @@ pub enum ActorKind {
     Fuser,
     /// The connection to the region.
     Uplink,
-    /// The node's election.
+    /// The driver of the node's leadership.
     LeaderElection,
-    /// The node's page.
+    /// The server of the node's page.
     Dashboard,
     /// The producer of a camera's reports, by its place in
     /// [`NodeConfig::all_cameras`](super::config::NodeConfig::all_cameras).
@@ -70,34 +70,34 @@ impl ActorKind {
 /// Addresses of the parts of a node.
 #[derive(Debug, Clone, Default)]
 pub struct ActorSlots {
-    /// The recorder's.
+    /// Address of the recorder, which writes the log.
     pub recorder: ActorSlot<RecorderMessage>,
-    /// The embedded broker's.
+    /// Address of the embedded broker's actor.
     pub broker: ActorSlot<BrokerMessage>,
-    /// The membership's.
+    /// Address of the membership, which sends datagrams.
     pub membership: ActorSlot<MembershipMessage>,
-    /// The keeper's of the cell's description.
+    /// Address of the keeper of the cell's description.
     pub description: ActorSlot<DescriptionKeeperMessage>,
-    /// The gateway's.
+    /// Address of the gateway, which publishes and receives.
     pub gateway: ActorSlot<GatewayMessage>,
-    /// The follower's.
+    /// Address of the follower, which accepts rounds.
     pub follower: ActorSlot<FollowerMessage>,
-    /// The reputation keeper's.
+    /// Address of the keeper of reputations.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
-    /// The fuser's.
+    /// Address of the fuser, which closes rounds.
     pub fuser: ActorSlot<FuserMessage>,
-    /// The uplink's.
+    /// Address of the uplink to the region.
     pub uplink: ActorSlot<UplinkMessage>,
-    /// The election's.
+    /// Address of the leader election.
     pub election: ActorSlot<LeaderElectionMessage>,
-    /// The dashboard's.
+    /// Address of the dashboard, which serves the page.
     pub dashboard: ActorSlot<DashboardMessage>,
-    /// The pose receiver's.
+    /// Address of the receiver of poses.
     pub pose_receiver: ActorSlot<PoseReceiverMessage>,
-    /// The projectors', one for each camera.
+    /// Addresses of the projectors, one for each camera.
     #[cfg(feature = "camera")]
     pub projectors: Vec<ActorSlot<ProjectorMessage>>,
-    /// The detectors', one for each camera.
+    /// Addresses of the detectors, one for each camera.
     #[cfg(feature = "camera")]
     pub detectors: Vec<ActorSlot<DetectorMessage>>,
 }

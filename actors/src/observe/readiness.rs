@@ -36,7 +36,7 @@ pub struct Vitals {
     pub newest: Newest,
     /// The leadership, as it changes.
     pub leadership: watch::Receiver<Leadership>,
-    /// The cell's time.
+    /// The cell's time, shared by the node's actors.
     pub clock: CellClock,
     /// Which brokers carry the data.
     pub plane: DataPlane,
@@ -64,7 +64,7 @@ pub struct SharedFacts {
     pub round_period_s: f64,
     /// The algorithms that the cell runs.
     pub algorithms: Algorithms,
-    /// The cell's landmarks.
+    /// All landmarks of the cell.
     pub landmarks: Arc<[LandmarkConfig]>,
     /// Projects the boxes of programs.
     pub boxes: Arc<BoxProjector>,

@@ -10,7 +10,7 @@ use ecod::model::time::Timestamp;
 pub struct CellClock(Arc<Mutex<ClockReading>>);
 
 impl CellClock {
-    /// The current reading.
+    /// The current offset to the cell's time, and its error.
     pub fn reading(&self) -> ClockReading {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }

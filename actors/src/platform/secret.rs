@@ -35,7 +35,7 @@ impl Secret {
         Self(text.into())
     }
 
-    /// The text itself.
+    /// The text of the secret, which must not be logged.
     pub fn reveal(&self) -> &str {
         &self.0
     }

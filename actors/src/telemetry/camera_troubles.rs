@@ -20,7 +20,7 @@ impl CameraTroubles {
         Self { counters, part }
     }
 
-    /// Records a trouble.
+    /// Records that a trouble of the camera was observed now, and its cause.
     pub fn record(&self, kind: TroubleKind, cause: &str) {
         match &self.part {
             Some(part) => self

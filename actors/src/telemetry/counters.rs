@@ -138,7 +138,7 @@ pub enum Event {
 }
 
 impl Event {
-    /// All events.
+    /// All events in order of declaration.
     pub const ALL: &'static [Self] = Self::VARIANTS;
 
     /// The label of the event's counter.
@@ -174,7 +174,7 @@ impl Default for Counters {
 }
 
 impl Counters {
-    /// Counts an event.
+    /// Counts one occurrence of an event.
     pub fn count(&self, event: Event) {
         self.add(event, 1);
     }

@@ -46,7 +46,7 @@ pub const MAX_PAYLOAD_BYTES: usize = 1200;
 /// A node of the cell.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Member {
-    /// Its name.
+    /// Name of the node; in a cell with certificates, the name in its certificate.
     pub name: NodeName,
     /// Time of its start in Unix microseconds, by its own clock.
     pub run: u64,
@@ -66,7 +66,7 @@ pub struct Member {
 pub enum MembershipEvent {
     /// A node is alive, or a new run of it.
     Alive {
-        /// The node.
+        /// The node with its current addresses.
         member: Member,
     },
     /// A node does not answer. It is declared down unless it answers soon.
@@ -92,13 +92,13 @@ pub enum MembershipEvent {
     },
     /// This node's own address changed; connections from the earlier address are dead.
     Moved,
-    /// A datagram arrived.
+    /// A datagram of another node arrived.
     Received {
-        /// The authenticated sender.
+        /// Node that sent it, as its session proves.
         from: NodeName,
         /// Its rights by its certificate; all in a cell without certificates.
         rights: Rights,
-        /// The payload.
+        /// The payload as its sender passed it.
         payload: Bytes,
         /// Time of arrival by this node's clock.
         received_at: Timestamp,

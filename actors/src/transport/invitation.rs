@@ -49,7 +49,7 @@ const HOST_NAME: &str = "invitation.ecod.internal";
 /// The last message of both.
 const KEPT: &str = "kept";
 
-/// The guest's wish.
+/// First message of the guest: its request for a certificate.
 #[derive(Debug, Serialize, Deserialize)]
 struct Request {
     node: NodeName,
@@ -59,7 +59,7 @@ struct Request {
     request: String,
 }
 
-/// The host's answer.
+/// Answer of the host to a request.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Reply {

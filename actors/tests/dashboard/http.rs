@@ -135,7 +135,6 @@ impl Events {
         Self(BufReader::new(stream))
     }
 
-    /// The next picture.
     pub(crate) async fn next(&mut self) -> serde_json::Value {
         loop {
             let mut line = String::new();

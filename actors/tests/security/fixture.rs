@@ -32,7 +32,7 @@ pub(crate) const GONE_WITHIN: Duration = Duration::from_secs(2);
 /// Largest packet of the broker.
 pub(crate) const MAX_PACKET: usize = 64 * 1024;
 
-/// Largest report.
+/// Maximum size of a report in bytes.
 pub(crate) const MAX_REPORT: usize = 16 * 1024;
 
 /// Most clients of one certificate.

@@ -37,7 +37,6 @@ use crate::attacks::row::{Outcome, Row, table};
 use crate::machine::Machine;
 use crate::network;
 
-/// Kinds of attackers.
 const ATTACKERS: [&[Row]; 6] = [
     stranger::ROWS,
     key_holder::ROWS,

@@ -41,7 +41,6 @@ impl Process {
         Ok(Self { child })
     }
 
-    /// Its number.
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }

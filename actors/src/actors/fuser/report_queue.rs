@@ -50,9 +50,9 @@ impl Default for Waiting {
 /// A report and its algorithm.
 #[derive(Debug)]
 pub struct QueuedReport {
-    /// The algorithm.
+    /// Algorithm for which the report was sent.
     pub kind: ReportKind,
-    /// The report.
+    /// The report, decoded and within the limits.
     pub report: Arc<ObjectReport>,
 }
 

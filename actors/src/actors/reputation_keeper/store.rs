@@ -24,7 +24,7 @@ use crate::transport::pki::EvidenceSigner;
 /// Evidence about vehicles; it outlives individual runs of the actor that keeps it.
 #[derive(Debug)]
 pub struct ReputationStore {
-    /// The evidence.
+    /// Evidence of this node and of the candidates whose shares it merged.
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
     pub standing: BTreeMap<NodeName, Reputation>,
@@ -143,7 +143,7 @@ impl SharedReputations {
         self.open().by_evidence = by_evidence;
     }
 
-    /// Locks the store.
+    /// Locks the store until the guard is dropped.
     pub fn open(&self) -> MutexGuard<'_, ReputationStore> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -15,12 +15,12 @@ use crate::camera::lens::Lens;
 /// A board of given size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GroundBoard {
-    /// A QR code.
+    /// A QR code of which the side is given.
     QrCode {
         /// Side of the code without its quiet zone, in millimetres.
         side_mm: f64,
     },
-    /// A chessboard.
+    /// A chessboard of which corners and squares are given.
     Chessboard(Chessboard),
 }
 
@@ -38,10 +38,10 @@ pub enum BoardError {
     /// No camera fits the board.
     #[error("the board gives no camera")]
     Fit(#[from] GroundFitError),
-    /// The decoder failed.
+    /// The detector of QR codes failed.
     #[error("cannot look for codes")]
     Decoder(#[from] DetectError),
-    /// OpenCV failed.
+    /// OpenCV failed in a step of the fit.
     #[error("opencv failed on the board")]
     OpenCv(#[from] opencv::Error),
 }

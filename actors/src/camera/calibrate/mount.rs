@@ -25,7 +25,7 @@ pub struct GroundPoint {
 pub struct GroundFit {
     /// Pose of the camera in the frame of the points.
     pub pose: Pose,
-    /// Height and tilt.
+    /// Height, pitch and roll of the camera, with standard deviations.
     pub estimate: MountEstimate,
     /// Fit of each point, in their order.
     pub points: Vec<PointFit>,
@@ -46,10 +46,10 @@ pub struct PointFit {
 /// Error of a fit to points on the ground.
 #[derive(Debug, thiserror::Error)]
 pub enum GroundFitError {
-    /// Too few points.
+    /// Fewer than [`MIN_POINTS`] points; the value is their number.
     #[error("{0} points, need {MIN_POINTS}: measure more, spread over the image")]
     TooFewPoints(usize),
-    /// No camera fits.
+    /// No pose of a camera agrees with [`MIN_POINTS`] of the points.
     #[error(
         "no camera sees {MIN_POINTS} of the points where they are: check the numbers, their order and signs, and \
          `camera.optics`; of more points the wrong ones are named"
@@ -65,7 +65,7 @@ pub enum GroundFitError {
         "the points leave the pitch open by ±{0:.1}°: spread them over the image, not on one line, and measure again"
     )]
     Undetermined(f64),
-    /// OpenCV failed.
+    /// OpenCV could not solve the equations of the points.
     #[error("opencv cannot solve the points: spread them over the image, not on one line")]
     OpenCv(#[from] opencv::Error),
 }

@@ -20,7 +20,7 @@ pub enum DetectorConfig {
     Placard(PlacardConfig),
     /// The 80 kinds of objects of COCO.
     Coco(CocoConfig),
-    /// An exported model.
+    /// A neural network in a file of the ONNX format.
     Onnx(OnnxConfig),
     /// Detections from a file.
     Recorded(RecordedConfig),

@@ -169,7 +169,7 @@ pub enum OnnxError {
         path: PathBuf,
         /// Size of the network.
         taken: ImageSize,
-        /// The configured size.
+        /// Size that `input_px` configures.
         told: ImageSize,
     },
     /// The network fails at the configured size.
@@ -192,7 +192,7 @@ pub enum OnnxError {
     UnknownOutputs {
         /// Path of the model file.
         path: PathBuf,
-        /// Names and shapes.
+        /// Names and shapes of the outputs, as text.
         outputs: String,
         /// Size of the input.
         size: ImageSize,
@@ -216,7 +216,7 @@ pub enum OnnxError {
     UnknownFirstClass {
         /// Path of the model file.
         path: PathBuf,
-        /// Names and shapes.
+        /// Names and shapes of the outputs, as text.
         outputs: String,
     },
     /// The names in the metadata cannot be read.
@@ -226,7 +226,7 @@ pub enum OnnxError {
     BadNames {
         /// Path of the model file.
         path: PathBuf,
-        /// The fault.
+        /// Reason why the names cannot be read.
         fault: String,
     },
     /// The names in the metadata have other numbers than the outputs.
@@ -250,11 +250,11 @@ pub enum OnnxError {
     NameCount {
         /// Path of the model file.
         path: PathBuf,
-        /// Count of names.
+        /// Number of names in the metadata.
         names: usize,
-        /// Names and shapes.
+        /// Names and shapes of the outputs, as text.
         outputs: String,
-        /// Count of classes.
+        /// Number of classes in the outputs.
         classes: usize,
     },
     /// The network takes bytes, so that no other range of values is possible.
@@ -278,9 +278,9 @@ pub enum OnnxError {
     LabelCount {
         /// The file of the labels.
         path: PathBuf,
-        /// Count of labels.
+        /// Number of labels in the file.
         labels: usize,
-        /// Count of classes.
+        /// Number of classes of the model.
         classes: usize,
     },
     /// A name cannot be a label.
@@ -288,7 +288,7 @@ pub enum OnnxError {
     BadLabel {
         /// The file of the labels or of the model.
         path: PathBuf,
-        /// The name.
+        /// The name that cannot be a label.
         label: String,
     },
     /// No labels are available.
@@ -298,7 +298,7 @@ pub enum OnnxError {
     NoLabels {
         /// Path of the model file.
         path: PathBuf,
-        /// Count of classes.
+        /// Number of classes of the model.
         classes: usize,
     },
     /// A threshold is for a label that the model does not have.
@@ -306,9 +306,9 @@ pub enum OnnxError {
     UnknownLabel {
         /// Path of the model file.
         path: PathBuf,
-        /// The label.
+        /// Label that `thresholds` names.
         label: String,
-        /// The model's labels.
+        /// All labels of the model, as text.
         labels: String,
     },
 }

@@ -164,7 +164,7 @@ fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, De
         .collect())
 }
 
-/// One decoded code.
+/// A QR code that was decoded in an image.
 pub(crate) struct Code {
     text: Vec<u8>,
     /// Modules along a side.

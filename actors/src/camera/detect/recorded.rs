@@ -37,7 +37,7 @@ pub enum RecordingError {
     Unreadable {
         /// Path of the file.
         path: PathBuf,
-        /// The system's error.
+        /// Error of the operating system.
         #[source]
         source: std::io::Error,
     },
@@ -48,7 +48,7 @@ pub enum RecordingError {
         path: PathBuf,
         /// Line number, from 1.
         line: usize,
-        /// The flaw.
+        /// Reason why the line cannot be used.
         reason: String,
     },
 }

@@ -66,21 +66,21 @@ impl CaptureConfig {
 /// State of a source.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum CaptureStatus {
-    /// No frame yet.
+    /// The source is being opened, or has delivered no frame yet.
     #[default]
     Opening,
-    /// Frames arrive.
+    /// The last frame arrived in time.
     Running,
     /// The source failed and will be reopened.
     Failed {
-        /// The error.
+        /// Error of the last attempt.
         error: FrameError,
         /// Failures in a row.
         failures: u32,
         /// Time to the next attempt.
         retry_after: Duration,
     },
-    /// A file ended.
+    /// A file or sequence ended, and is not repeated.
     Ended,
 }
 

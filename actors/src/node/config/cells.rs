@@ -30,7 +30,7 @@ struct CellsFile {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellEntry {
-    /// The cell's name.
+    /// Name of the cell, as its nodes have it.
     pub name: NodeName,
     /// Latitude of its middle in degrees, north positive.
     pub latitude_deg: f64,
@@ -88,7 +88,7 @@ impl CellEntry {
         check_range("radius_m", self.radius_m, 1.0, 1e5)
     }
 
-    /// The cell's place.
+    /// Name, place and radius of the cell, by which a vehicle chooses it.
     pub fn known(&self) -> KnownCell {
         KnownCell {
             name: self.name.clone(),

@@ -19,9 +19,9 @@ use super::NodeConfig;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SharedConfig {
-    /// Settings of fusion.
+    /// Settings of fusion, used by every aggregator.
     pub fusion: FusionConfig,
-    /// The landmarks.
+    /// All landmarks of the cell.
     pub landmarks: Vec<LandmarkConfig>,
     /// The place of the cell's frame on Earth. Default: not set.
     pub origin: Option<GeographicOrigin>,
@@ -33,7 +33,7 @@ pub struct SharedConfig {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SharedCamera {
-    /// Settings of projection.
+    /// Settings of projection, used for every camera.
     pub projection: SharedProjection,
 }
 
@@ -84,7 +84,7 @@ pub enum DescriptionError {
          {described}; remove the key from the node's configuration, or change the description by `ecod-node cell set`"
     )]
     Contradicts {
-        /// Configuration key.
+        /// Full key of the configuration, such as `fusion.pace.gate_m`.
         key: String,
         /// The node's own value.
         own: String,

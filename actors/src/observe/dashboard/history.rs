@@ -16,9 +16,7 @@ use super::timeline::Timeline;
 /// One leader's time in the lead, as observed by this node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct LeaderTerm {
-    /// The leader.
     pub leader: NodeName,
-    /// Its term.
     pub epoch: u64,
     /// Time at which this node began to follow it.
     pub from_us: Timestamp,
@@ -34,7 +32,6 @@ pub(crate) struct LeaderTerm {
 struct VitalsSample<'a> {
     /// End of the period.
     at_us: Timestamp,
-    /// Rounds accepted.
     rounds: u32,
     /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a
     /// map.
@@ -48,7 +45,6 @@ struct VitalsSample<'a> {
 /// Leader terms, events, maps and samples, oldest first.
 #[derive(Debug)]
 pub(crate) struct History {
-    /// The latest terms.
     pub terms: VecDeque<LeaderTerm>,
     /// Events and maps of the latest [`SPAN`].
     pub timeline: Timeline,

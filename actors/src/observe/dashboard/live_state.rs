@@ -53,7 +53,7 @@ pub struct LatestReport {
     /// Time of receipt by this node's clock.
     #[serde(rename = "received_at_us")]
     pub received_at: Timestamp,
-    /// The report.
+    /// The report as it was received.
     pub report: Arc<ObjectReport>,
 }
 

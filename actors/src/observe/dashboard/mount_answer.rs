@@ -13,7 +13,7 @@ use crate::camera::mount_calibration::{
 /// Settings of a camera that fitting its mount needs, in addition to points.
 #[derive(Debug, Clone)]
 pub struct CameraSetup {
-    /// Configured optics.
+    /// Configured optics of the camera.
     pub optics: OpticsConfig,
     /// Configured mount, with which the camera's pose is reported.
     pub mount: MountConfig,

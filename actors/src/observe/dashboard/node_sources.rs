@@ -22,11 +22,11 @@ use crate::transport::gossip::{FrameCounters, Member};
 /// All inputs that the dashboard reads from its node.
 #[derive(Debug, Clone)]
 pub struct NodeSources {
-    /// The node.
+    /// Facts about the node at its start.
     pub node: NodeFacts,
     /// Newest messages, leadership, links and broker.
     pub vitals: Vitals,
-    /// The other nodes.
+    /// All living nodes except this one.
     pub members: watch::Receiver<Vec<Member>>,
     /// Counters of the node.
     pub counters: Arc<Counters>,
@@ -45,11 +45,11 @@ pub struct NodeSources {
 pub struct ShownCamera {
     /// Its name, if it has one.
     pub name: Option<String>,
-    /// Its pictures.
+    /// Feed of the camera's pictures.
     pub feed: Arc<CameraFeed>,
     /// Name under which it reports.
     pub reporter: NodeName,
-    /// Its settings.
+    /// Settings with which the camera's mount is fitted.
     #[cfg(feature = "camera")]
     pub setup: CameraSetup,
 }
@@ -61,7 +61,7 @@ pub struct NodeFacts {
     pub name: NodeName,
     /// Name of its cell.
     pub cell: NodeName,
-    /// Its role.
+    /// Role with which the node was started.
     pub role: Role,
     /// True if `/api/camera` shows the pictures of its cameras.
     pub camera: bool,
@@ -73,7 +73,7 @@ pub struct NodeFacts {
     pub floor_plan: Option<FloorPlanFacts>,
     /// Version of the software.
     pub version: &'static str,
-    /// Time of start.
+    /// Start of the node in Unix microseconds by its clock.
     pub started_at_us: Timestamp,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
@@ -121,7 +121,7 @@ impl NodeSources {
     }
 }
 
-/// A landmark.
+/// A landmark in the form for the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LandmarkFacts {
     /// Name of the location.

@@ -13,7 +13,6 @@ pub(crate) struct ResponseCache<T> {
     cached: Mutex<Option<CachedResponse<T>>>,
 }
 
-/// A computed response.
 #[derive(Debug, Clone)]
 pub(crate) struct CachedResponse<T> {
     pub(crate) value: T,

@@ -166,7 +166,6 @@ struct MissingAnswer {
     node: NodeName,
     /// Time at which it last answered, by this node's clock.
     last_seen_us: Timestamp,
-    /// Seconds since then.
     missing_s: u64,
 }
 

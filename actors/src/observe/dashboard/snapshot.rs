@@ -32,7 +32,6 @@ pub(crate) struct Snapshot {
     pub schema: u32,
     /// Time of the snapshot.
     pub now_us: Timestamp,
-    /// This node.
     pub node: NodeFacts,
     /// Readiness of this node.
     pub readiness: Readiness,
@@ -61,7 +60,6 @@ pub(crate) struct Snapshot {
 pub(crate) struct TroubleEntry {
     /// The node that reports the trouble.
     pub told_by: NodeName,
-    /// The trouble.
     #[serde(flatten)]
     pub trouble: Trouble,
 }
@@ -69,7 +67,6 @@ pub(crate) struct TroubleEntry {
 /// The leadership of the cell, for a browser.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct LeadershipFacts {
-    /// This node's position.
     pub position: Position,
     /// The leader; absent while the node seeks one.
     pub leader: Option<NodeName>,
@@ -88,7 +85,6 @@ pub(crate) struct LeadershipFacts {
 pub(crate) struct NodeEntry {
     /// Name of the node.
     pub name: NodeName,
-    /// Its role.
     pub role: Role,
     /// True if the node answers. A node that has not answered yet counts as alive while a linked
     /// broker reports its status.

@@ -29,7 +29,6 @@ pub(crate) struct Timeline {
 pub(crate) struct TimelineEvent {
     /// Time of the event.
     pub at_us: Timestamp,
-    /// Its kind.
     pub kind: EventKind,
     /// The event as text.
     pub text: String,
@@ -39,11 +38,9 @@ pub(crate) struct TimelineEvent {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum EventKind {
-    /// A node joined.
     Joined,
     /// A node left, or does not answer.
     Lost,
-    /// A trouble began.
     Trouble,
     /// A vehicle is contradicted by the others more often than not.
     Distrusted,
@@ -56,7 +53,6 @@ pub(crate) enum EventKind {
 pub(crate) struct TimelineFrame {
     /// Time of receipt.
     pub now_us: Timestamp,
-    /// The map.
     pub map: Option<Received<GlobalMap>>,
     /// Newest verdicts at that time.
     pub verdicts: Option<Received<Verdicts>>,
@@ -165,7 +161,6 @@ impl Timeline {
             .retain(|name| newest.reputations.contains_key(name));
     }
 
-    /// Adds an event.
     pub(crate) fn event(&mut self, kind: EventKind, text: String, at_us: Timestamp) {
         let is_old = |oldest: &TimelineEvent| at_us.since(oldest.at_us) > self.frames.span;
         while self.events.len() >= MAX_EVENTS || self.events.front().is_some_and(is_old) {

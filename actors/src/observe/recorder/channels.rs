@@ -29,7 +29,7 @@ macro_rules! schemas {
         }
 
         impl SchemaName {
-            /// All schemas.
+            /// All schemas in order of declaration.
             pub const ALL: [Self; [$($name),*].len()] = [$(Self::$schema),*];
 
             /// The name in the log.
@@ -50,7 +50,7 @@ macro_rules! schemas {
 }
 
 schemas! {
-    /// A vehicle's report.
+    /// Report of one vehicle for one algorithm.
     ObjectReport(wire::ObjectReport) = "ecod.ObjectReport",
     /// The map of a round.
     GlobalMap(wire::GlobalMap) = "ecod.GlobalMap",
@@ -58,9 +58,9 @@ schemas! {
     Verdicts(wire::Verdicts) = "ecod.Verdicts",
     /// The reputations of all vehicles.
     Reputations(wire::Reputations) = "ecod.Reputations",
-    /// Another candidate's evidence.
+    /// Share of another candidate's evidence.
     LedgerShare(wire::LedgerShare) = "ecod.LedgerShare",
-    /// A node's status.
+    /// Status that a node has published.
     NodeStatus(wire::NodeStatus) = "ecod.NodeStatus",
     /// A change of the leadership as observed by the recording node.
     Leadership(LeadershipChange) = "ecod.Leadership",
@@ -70,11 +70,11 @@ schemas! {
     JournalEntry(JournalEntry) = "ecod.JournalEntry",
     /// A drawing of map or report.
     SceneUpdate(foxglove::scene::SceneUpdate) = "foxglove.SceneUpdate",
-    /// A vehicle's pose.
+    /// Pose of a vehicle in the map's frame.
     FrameTransform(foxglove::FrameTransform) = "foxglove.FrameTransform",
-    /// A log line.
+    /// Line of text for viewers.
     Log(foxglove::Log) = "foxglove.Log",
-    /// A camera image.
+    /// Compressed image of a camera.
     CompressedImage(foxglove::picture::CompressedImage) = "foxglove.CompressedImage",
     /// The optics of a camera's images.
     CameraCalibration(foxglove::picture::CameraCalibration) = "foxglove.CameraCalibration",

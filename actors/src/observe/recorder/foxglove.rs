@@ -122,7 +122,7 @@ pub(crate) fn optical_frame(reporter: &NodeName) -> String {
 }
 
 impl FrameTransform {
-    /// A vehicle's pose.
+    /// The transform of a vehicle's pose in the map's frame.
     pub(crate) fn of(node: &NodeName, pose: WirePose, at: Timestamp) -> Self {
         let FoxglovePose {
             position: translation,

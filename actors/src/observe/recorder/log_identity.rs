@@ -12,9 +12,9 @@ use uuid::Uuid;
 pub struct LogIdentity {
     /// Version of the log format, [`LogIdentity::VERSION`].
     pub log: u64,
-    /// The recording node.
+    /// Name of the recording node.
     pub node: NodeName,
-    /// Its cell.
+    /// Name of the cell of that node.
     pub cell: NodeName,
     /// The run of the node.
     pub run: Uuid,
@@ -32,7 +32,7 @@ pub enum LogIdentityError {
     /// A key is missing or has an unusable value.
     #[error("metadata `{key}` of the log cannot be used: {reason}")]
     Key {
-        /// Configuration key.
+        /// Key of the metadata record.
         key: &'static str,
         /// Description of the problem.
         reason: String,
@@ -66,7 +66,7 @@ impl LogIdentity {
         }
     }
 
-    /// The record's content.
+    /// Content of the metadata record, by its keys.
     pub(crate) fn to_map(&self) -> BTreeMap<String, String> {
         let json = |value: serde_json::Result<String>| value.unwrap_or_default();
         [

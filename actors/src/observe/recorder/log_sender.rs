@@ -42,7 +42,7 @@ pub enum LogItem {
     Verdicts(Arc<Verdicts>),
     /// Reputations that the node accepted.
     Reputations(Arc<Reputations>),
-    /// Another candidate's evidence.
+    /// A share of another candidate's evidence.
     Share(Arc<LedgerShare>),
     /// The status of a node, also of this one.
     Status(Arc<NodeStatus>),
@@ -50,7 +50,7 @@ pub enum LogItem {
     Leadership(Leadership),
     /// A change of the link to a broker.
     Link(BrokerAddress, LinkState),
-    /// The node's counters.
+    /// Counters of the node at this moment.
     Counters(CounterSnapshot),
     /// A picture of a camera.
     Picture(Box<CapturedPicture>),

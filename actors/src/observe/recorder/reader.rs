@@ -27,14 +27,14 @@ const MAX_RECORD_BYTES: usize = 1 << 28;
 pub enum LogEvent {
     /// Identity of the log, at its beginning.
     Identity(Box<LogIdentity>),
-    /// A message.
+    /// A message, with its topic and time.
     Message(LogMessage),
 }
 
 /// One message of a log.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LogMessage {
-    /// Its schema.
+    /// Schema of the message's channel.
     pub schema: SchemaName,
     /// The topic without the cell's root.
     pub topic: String,
@@ -67,7 +67,7 @@ pub enum LogError {
     Damaged {
         /// Path of the file.
         path: PathBuf,
-        /// The damage.
+        /// Error of the reader of MCAP files.
         source: McapError,
     },
     /// A later version of the program wrote it.
@@ -75,7 +75,7 @@ pub enum LogError {
     Newer {
         /// Path of the file.
         path: PathBuf,
-        /// Its version.
+        /// Version of the format in the file.
         found: u64,
     },
     /// Its metadata cannot be used.

@@ -17,7 +17,6 @@ const SLICES: usize = 700;
 /// Maximum number of curves in a plot; a table has all.
 const MAX_CURVES: usize = 12;
 
-/// Writes the page.
 pub(super) fn write(report: &Report) -> String {
     let added: String = report
         .sections

@@ -20,11 +20,9 @@ pub(super) struct Plot<'a> {
     pub(super) curves: Vec<Curve>,
     /// Vertical lines and their descriptions.
     pub(super) marks: Vec<(f64, String)>,
-    /// The horizontal axis.
     pub(super) x: Axis,
 }
 
-/// A horizontal axis.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Axis {
     /// From 0 to this.

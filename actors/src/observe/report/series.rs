@@ -28,12 +28,10 @@ impl Samples {
             .collect()
     }
 
-    /// The values alone.
     pub(super) fn values(&self) -> Vec<f64> {
         self.values.iter().map(|(_, value)| *value).collect()
     }
 
-    /// The newest value.
     pub(super) fn newest(&self) -> Option<f64> {
         self.values.last().map(|(_, value)| *value)
     }

@@ -149,12 +149,10 @@ impl LogTimeline {
         self.timeline.troubles(troubles, now);
     }
 
-    /// Takes reputations.
     pub(super) fn reputations(&mut self, reputations: &Reputations, now: Timestamp) {
         self.timeline.reputations(reputations, now);
     }
 
-    /// Processes a map.
     pub(super) fn map(&mut self, map: &GlobalMap, now: Timestamp) {
         self.frame(Some(map), now);
     }
@@ -170,7 +168,6 @@ impl LogTimeline {
         }
     }
 
-    /// Processes an image.
     pub(super) fn picture(&mut self, picture: RecordedPicture, at_us: Timestamp) {
         self.pictures
             .push(at_us, || json(&RecordedPicture { at_us, ..picture }));

@@ -33,7 +33,7 @@ pub enum ShedReason {
 }
 
 impl ShedReason {
-    /// All reasons.
+    /// All reasons in order of declaration.
     pub const ALL: &'static [Self] = Self::VARIANTS;
 
     /// The label of the reason's counter.
@@ -45,11 +45,11 @@ impl ShedReason {
 /// Messages of one source that were not used for one reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SourceCount<R> {
-    /// Reason.
+    /// Reason for which the messages were not used.
     pub reason: R,
     /// Name of the node, or address or id of the broker's client.
     pub source: String,
-    /// Number of messages.
+    /// Number of these messages so far.
     pub times: u64,
 }
 

@@ -41,7 +41,7 @@ struct AddressEntry {
 /// Source of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClientOrigin {
-    /// A throttled address.
+    /// Another machine, whose connections are throttled.
     Remote(IpAddr),
     /// This machine, where a whole cell may run and nodes cannot be distinguished. Only waiting
     /// connections are limited.

@@ -49,7 +49,7 @@ pub struct DoorSetup {
     pub node: NodeName,
     /// Client id of the node's own gateway.
     pub gateway_id: String,
-    /// The cell's topics.
+    /// Topics of the cell, by which messages are routed.
     pub topics: Topics,
     /// Limits of the messages that the node accepts.
     pub limits: Limits,
@@ -76,7 +76,7 @@ pub struct DoorSetup {
     pub dismiss: Arc<dyn Fn(NodeName) -> Result<(), String> + Send + Sync>,
     /// Starts or stops receiving the reports of all vehicles.
     pub watch_reports: Arc<dyn Fn(bool) + Send + Sync>,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
 }
 

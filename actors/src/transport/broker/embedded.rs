@@ -70,7 +70,7 @@ pub enum BrokerError {
     /// The address is busy, not this machine's, or not permitted.
     #[error("broker cannot listen on {address}: {reason}")]
     Bind {
-        /// The requested address.
+        /// Address at which the broker was to listen.
         address: SocketAddr,
         /// The operating system's error.
         reason: String,
@@ -78,7 +78,7 @@ pub enum BrokerError {
     /// The operating system refused a thread or event queue.
     #[error("broker for {address} cannot get a thread: {source}")]
     Thread {
-        /// The requested address.
+        /// Address at which the broker was to listen.
         address: SocketAddr,
         /// The operating system's error.
         source: io::Error,

@@ -11,7 +11,6 @@ pub(super) struct OutboundQueue {
     packets: VecDeque<QueuedPacket>,
     /// Bytes of the first packet that were sent.
     sent: usize,
-    /// Bytes that wait.
     bytes: usize,
     scanner: PacketScanner,
     max_packets: usize,

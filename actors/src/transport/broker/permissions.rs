@@ -39,13 +39,13 @@ pub struct AccessPolicy {
     /// The node's certificates. Without them every client may log in and publish anything, within
     /// limits.
     pub credentials: Option<Arc<Credentials>>,
-    /// The cell's topics.
+    /// Topics of the cell, to which the rules apply.
     pub topics: Topics,
     /// Largest payloads that the cell's nodes accept.
     pub limits: Limits,
     /// Decides which node may publish maps, verdicts and reputations.
     pub elected: LeaderCheck,
-    /// The node's counters.
+    /// Counters of the node, shared by its actors.
     pub counters: Arc<Counters>,
 }
 
@@ -58,7 +58,6 @@ pub(super) struct Permissions {
 }
 
 impl Permissions {
-    /// Registers the hooks.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         use Type::{

@@ -158,7 +158,6 @@ impl PrincipalRegistry {
         Some(self.connections().get(&address?)?.principal.clone())
     }
 
-    /// Number of connections.
     pub(super) fn len(&self) -> usize {
         self.connections().len()
     }

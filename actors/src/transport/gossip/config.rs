@@ -38,7 +38,7 @@ pub struct MembershipConfig {
     /// are resolved and contacted repeatedly, without a time limit. Default: empty. Seeds may be
     /// absent, and may differ between nodes.
     pub seeds: Vec<String>,
-    /// Discovery by multicast.
+    /// Settings of the discovery by multicast.
     pub multicast: MulticastConfig,
     /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects
     /// failures sooner and costs packets.
@@ -196,7 +196,7 @@ impl MulticastConfig {
     }
 }
 
-/// Shortest key.
+/// Minimum length of a cell's key in bytes.
 pub(crate) const MIN_KEY_BYTES: usize = 12;
 
 fn is_host_and_port(text: &str) -> bool {

@@ -9,7 +9,7 @@ use strum::{IntoStaticStr, VariantArray};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, IntoStaticStr, VariantArray)]
 #[strum(serialize_all = "snake_case")]
 pub enum FrameEvent {
-    /// Sent.
+    /// Accepted by the socket for sending.
     Sent,
     /// Not sent: the socket or the network refused it.
     SendFailed,
@@ -21,7 +21,7 @@ pub enum FrameEvent {
     Oversized,
     /// Not a frame, or a body that cannot be decoded.
     Malformed,
-    /// Of another cell.
+    /// Received from a node of another cell.
     WrongCell,
     /// Not sealed with the cell's key for this node.
     BadSeal,
@@ -52,7 +52,7 @@ pub enum FrameEvent {
 }
 
 impl FrameEvent {
-    /// All events.
+    /// All events in order of declaration.
     pub const ALL: &'static [Self] = Self::VARIANTS;
 
     /// The label of the event's counter.
@@ -66,7 +66,7 @@ impl FrameEvent {
 pub struct FrameCounters([AtomicU64; FrameEvent::ALL.len()]);
 
 impl FrameCounters {
-    /// Counts one event.
+    /// Counts one frame with this event.
     #[expect(clippy::indexing_slicing, reason = "there is a place for every event")]
     pub fn count(&self, event: FrameEvent) {
         self.0[event as usize].fetch_add(1, Ordering::Relaxed);

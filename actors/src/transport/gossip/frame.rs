@@ -105,7 +105,7 @@ impl Handshake {
 /// Information that two nodes exchange in the handshake.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Introduction {
-    /// The sender.
+    /// Identity of the sender.
     pub(crate) id: NodeId,
     /// Address from which the receiver's packets reach the sender.
     pub(crate) seen_at: SocketAddr,

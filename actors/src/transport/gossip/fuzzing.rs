@@ -238,7 +238,7 @@ impl Listener {
         self.receive_sealed(1, &message);
     }
 
-    /// Lets time pass.
+    /// Advances the clock by `ms` milliseconds and runs the timers that are due.
     pub fn wait(&mut self, ms: u64) {
         self.now = self.now + Duration::from_millis(ms);
         self.own.tick(self.now);

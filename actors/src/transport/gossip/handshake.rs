@@ -71,7 +71,6 @@ pub(crate) struct SignedMessage<'a> {
     pub(crate) receiver: SessionId,
     /// The prover's transcript for an accepter; the accepter's name for a prover.
     pub(crate) context: &'a [u8],
-    /// The encoded message.
     pub(crate) message: &'a [u8],
 }
 

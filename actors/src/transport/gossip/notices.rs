@@ -16,7 +16,6 @@ pub(crate) struct GossipNotice {
 pub(crate) struct Notices(Vec<GossipNotice>);
 
 impl Notices {
-    /// Adds a notice.
     pub(crate) fn add(
         &mut self,
         about: &impl ToString,

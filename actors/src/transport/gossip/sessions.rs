@@ -89,7 +89,6 @@ pub(crate) struct KnownMember {
 pub(crate) struct Arrival<'a> {
     pub(crate) from: SocketAddr,
     pub(crate) now: Timestamp,
-    /// This node's identity.
     pub(crate) own: &'a NodeId,
     /// True if this node has not found another node.
     pub(crate) is_alone: bool,
@@ -137,7 +136,6 @@ pub(crate) enum FrameContent {
 }
 
 impl Sessions {
-    /// No sessions.
     pub(crate) fn new(setup: SessionsSetup<'_>, now: Timestamp) -> Self {
         let SessionsSetup {
             cell,

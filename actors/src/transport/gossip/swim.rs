@@ -88,7 +88,6 @@ impl Swim {
         self.outputs.pop_front()
     }
 
-    /// This node's identity.
     pub(crate) fn own(&self) -> &NodeId {
         self.foca.identity()
     }

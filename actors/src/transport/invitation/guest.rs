@@ -45,10 +45,10 @@ pub enum JoinError {
     Unreachable {
         /// All that were tried.
         addresses: String,
-        /// The last failure.
+        /// Error of the last attempt.
         reason: String,
     },
-    /// The host refuses.
+    /// The host refuses the request; the value is its reason.
     #[error("refused: {0}; ask for a new token by `ecod-node invite`")]
     Refused(String),
     /// Another program than the host is there, or the conversation broke off.

@@ -39,7 +39,7 @@ pub enum Incoming {
     Ledger(Arc<LedgerShare>),
     /// The status of another node, from itself or from its last will.
     Status {
-        /// The status.
+        /// The status as the node published it.
         status: Arc<NodeStatus>,
         /// The broker that forwarded it.
         via: BrokerAddress,
@@ -55,7 +55,7 @@ pub enum Incoming {
     Link {
         /// The broker at its other end.
         broker: BrokerAddress,
-        /// The new state.
+        /// State of the link from now on.
         state: LinkState,
     },
 }
@@ -64,7 +64,7 @@ pub enum Incoming {
 /// keep it until it is processed.
 #[derive(Debug)]
 pub struct Delivery<T = Incoming> {
-    /// The message.
+    /// The message, decoded and within the limits.
     pub message: T,
     /// Time when its packet was read from the socket, or when it was delivered in-process.
     pub received_at: Timestamp,

@@ -25,7 +25,7 @@ pub enum FromRegion {
     Map {
         /// Where it was published.
         topic: RegionTopic,
-        /// The map.
+        /// The map, decoded and within the limits.
         map: Box<CellMap>,
     },
     /// The status of another leader of the own cell, or a last will of this one.

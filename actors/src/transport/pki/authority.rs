@@ -89,11 +89,11 @@ pub enum AuthorityError {
     /// The CA of a cell where a city's CA is needed, or the reverse.
     #[error("{directory} has the CA of a {found}: {remedy}")]
     Kind {
-        /// The directory.
+        /// Directory of the CA.
         directory: PathBuf,
         /// `cell` or `city`.
         found: &'static str,
-        /// The remedy.
+        /// Advice to the operator, as an imperative phrase.
         remedy: &'static str,
     },
     /// The register cannot be read.
@@ -101,7 +101,7 @@ pub enum AuthorityError {
     Register {
         /// Path of the file.
         path: PathBuf,
-        /// The error.
+        /// Reason why the register cannot be read.
         reason: String,
     },
     /// The name contains the mark of observers.
@@ -350,12 +350,12 @@ impl Authority {
         directory.join(CA_KEY).exists()
     }
 
-    /// The CA's certificate.
+    /// Path of the CA's certificate in PEM.
     pub fn ca(&self) -> PathBuf {
         self.directory.join(CA)
     }
 
-    /// The revocation list.
+    /// Path of the CA's revocation list in PEM.
     pub fn revocation_list(&self) -> PathBuf {
         self.directory.join(LIST)
     }

@@ -95,7 +95,7 @@ pub enum CredentialsError {
         key: &'static str,
         /// Path of the file.
         path: PathBuf,
-        /// The error.
+        /// Reason why the file cannot be used.
         reason: String,
     },
     /// The certificate names another node.
@@ -105,7 +105,7 @@ pub enum CredentialsError {
         path: PathBuf,
         /// The node that it names.
         found: NodeName,
-        /// This node.
+        /// Name of this node.
         node: NodeName,
     },
     /// The node is configured to be more than its certificate allows.
@@ -116,11 +116,11 @@ pub enum CredentialsError {
     Overreached {
         /// Path of the file.
         path: PathBuf,
-        /// This node.
+        /// Name of this node.
         node: NodeName,
-        /// The configured role.
+        /// Role that `role` configures.
         role: &'static str,
-        /// The configured priority.
+        /// Priority that `election.priority` configures.
         priority: u8,
         /// Highest role and priority by the certificate.
         allowed: String,

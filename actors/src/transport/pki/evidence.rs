@@ -36,7 +36,7 @@ struct Signatory {
 /// The reason why evidence is not attributed to its aggregator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EvidenceError {
-    /// No signature.
+    /// The evidence has no signature.
     #[error("evidence without a signature")]
     Unsigned,
     /// The certificate is not from this cell, revoked, or expired.

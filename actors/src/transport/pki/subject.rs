@@ -103,7 +103,7 @@ impl CertificateSubject {
         Self::of(&certificate)
     }
 
-    /// The node's name.
+    /// Name of the node that the certificate is for.
     pub fn name(&self) -> &NodeName {
         &self.name
     }

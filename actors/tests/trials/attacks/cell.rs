@@ -111,13 +111,11 @@ pub(crate) struct Target {
     /// The attacked broker, and the broker of the candidate that does not lead.
     pub(crate) broker: SocketAddr,
     pub(crate) standby: SocketAddr,
-    /// The leader's process.
     pub(crate) leader_process: u32,
     /// Where the nodes gossip.
     pub(crate) gossip: Vec<SocketAddr>,
     /// The attacker's own address, another than the cell's.
     pub(crate) from: Ipv4Addr,
-    /// The cell's key.
     pub(crate) key: &'static str,
     /// TLS with the certificate of a vehicle, [`VEHICLE`].
     pub(crate) vehicle: Arc<ClientConfig>,
@@ -134,7 +132,6 @@ pub(crate) struct Target {
 }
 
 impl Target {
-    /// Counts deeds.
     pub(crate) fn did(&self, deeds: usize) {
         self.deeds.fetch_add(deeds as u64, Ordering::Relaxed);
     }
@@ -477,7 +474,6 @@ fn longest_gap_ms(maps: &[Line], from: Timestamp, until: Timestamp) -> u64 {
     longest.as_millis() as u64
 }
 
-/// The honest vehicles.
 fn honest() -> BTreeSet<&'static str> {
     NODES
         .into_iter()

@@ -367,7 +367,6 @@ impl Cell {
         self.index(&newest.epoch.leader)
     }
 
-    /// Its name.
     pub(crate) fn leader_name(&self) -> anyhow::Result<String> {
         Ok(self.nodes[self.leader()?].name.to_string())
     }

@@ -32,7 +32,6 @@ pub(crate) fn addresses(
     })
 }
 
-/// The cell's name.
 pub(crate) const CELL: &str = "trial";
 
 /// The only landmark of the cell.

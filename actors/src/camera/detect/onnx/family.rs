@@ -18,7 +18,7 @@ pub enum Family {
     Yolov5,
     /// YOLOv8, 11 and others of Ultralytics, with non-maximum suppression or without.
     Yolov8,
-    /// YOLOX.
+    /// YOLOX, exported without `--decode_in_inference`.
     Yolox,
     /// SSD of torchvision, of TensorFlow's Object Detection API and of pytorch-ssd.
     Ssd,
@@ -26,7 +26,7 @@ pub enum Family {
     Detr,
     /// RT-DETR of Ultralytics, of Hugging Face and of its authors; D-FINE.
     Rtdetr,
-    /// RF-DETR.
+    /// RF-DETR of Roboflow.
     Rfdetr,
 }
 

@@ -111,7 +111,6 @@ const FALLBACK_FPS: f64 = 25.0;
 /// Maximum time without a message while the next frame of a file is not due.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
-/// An open capture.
 struct Video {
     origin: String,
     capture: VideoCapture,

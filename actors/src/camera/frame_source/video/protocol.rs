@@ -34,7 +34,7 @@ pub(super) struct ImageHeader {
     pub(super) columns: i32,
     /// OpenCV's type of a pixel, such as `CV_8UC3`.
     pub(super) kind: i32,
-    /// Time of capture.
+    /// Time of capture since the boot of the machine.
     pub(super) since_boot: Duration,
 }
 

@@ -22,10 +22,10 @@ pub enum RenewalRefusal {
     /// Another CA has issued it.
     #[error("this CA has not issued its certificate")]
     NotIssued,
-    /// It was revoked.
+    /// The certificate was revoked.
     #[error("its certificate was revoked")]
     Revoked,
-    /// It has ended.
+    /// The certificate has expired.
     #[error("its certificate has ended")]
     Ended,
     /// It does not end soon.

@@ -22,7 +22,7 @@ pub(super) struct CityAuthorities {
     pub(super) of_cell: Vec<CertificateDer<'static>>,
     /// CAs of the cell that the city has revoked.
     pub(super) revoked: Vec<CertificateDer<'static>>,
-    /// The city's own.
+    /// Certificates of the city's own CAs.
     pub(super) of_city: Vec<CertificateDer<'static>>,
 }
 
