@@ -270,6 +270,9 @@ impl DescriptionKeeperState {
         self.applied = Some(loaded);
     }
 
+    /// Carries out the effects of the exchange in order: a new description is marked for saving and
+    /// passed to the node, a description to publish goes to the gateway, and an implausible version
+    /// is counted.
     fn carry_out(&mut self, effects: Vec<DescriptionEffect>) {
         for effect in effects {
             match effect {
@@ -295,6 +298,8 @@ impl DescriptionKeeperState {
         }
     }
 
+    /// Saves the history if it has changed. A disk that fails is recorded as a trouble until a
+    /// later attempt succeeds.
     async fn save(&mut self) {
         if self.exchange.current().is_some() {
             let troubles = self.counters.troubles();

@@ -170,6 +170,12 @@ impl FollowerState {
         }
     }
 
+    /// Handles a map from a link or from this node's fuser. An accepted map goes to the fuser,
+    /// which continues from it if its term is confirmed; then to election, log, recording, watchers
+    /// and local programs.
+    ///
+    /// # Errors
+    /// Returns the reason why the filter refused the map; no state has changed for receivers.
     fn on_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
         let Delivery {
             message: map,
@@ -209,6 +215,10 @@ impl FollowerState {
         Ok(())
     }
 
+    /// Handles verdicts: accepted ones go to recording, election, watchers and local programs.
+    ///
+    /// # Errors
+    /// Returns the reason why the filter refused the verdicts.
     fn on_verdicts(&mut self, delivery: &Delivery<Arc<Verdicts>>) -> Result<(), Refusal> {
         let Delivery {
             message: verdicts,
@@ -236,6 +246,11 @@ impl FollowerState {
         Ok(())
     }
 
+    /// Handles reputations: accepted ones go to recording, watchers and local programs. They are no
+    /// sign of life, because brokers retain them.
+    ///
+    /// # Errors
+    /// Returns the reason why the filter refused the reputations.
     fn on_reputations(&mut self, delivery: &Delivery<Arc<Reputations>>) -> Result<(), Refusal> {
         let Delivery {
             message: reputations,
@@ -261,6 +276,7 @@ impl FollowerState {
         Ok(())
     }
 
+    /// Reports an accepted round to the election if the round is a sign of life of its leader.
     fn notify_election(&self, accepted: AcceptedRound) {
         let AcceptedRound {
             epoch,

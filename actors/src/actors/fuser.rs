@@ -240,12 +240,21 @@ impl FuserState {
         }
     }
 
+    /// Passes all waiting reports to the aggregator, in the order of the queue.
     fn drain_reports(&mut self) {
         for delivery in self.report_queue.drain() {
             self.on_delivery(&delivery);
         }
     }
 
+    /// Handles one report: records it, passes it to the aggregator, and publishes the round if the
+    /// report closes it. A used report is checked for doubts and for its sender's clock; another
+    /// report is counted by its reason.
+    ///
+    /// # Example
+    /// The leader waits for `euclid` and `gauss`. The report of `gauss` arrives last: the
+    /// aggregator closes round 89 at once, and the map goes to the gateway before the round's
+    /// deadline.
     fn on_delivery(&mut self, delivery: &Delivery<QueuedReport>) {
         let QueuedReport { kind, report } = &delivery.message;
         self.recording.send(
@@ -415,6 +424,9 @@ impl FuserState {
         self.command(Command::Expel { vehicle });
     }
 
+    /// Starts the leadership: the keeper gets the epoch and the last round, the aggregator takes
+    /// over the identities of a recent map of the previous leader, and a round that is already due
+    /// is closed.
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.reports = RoundReports::default();
         self.keeper.send(ReputationKeeperMessage::Lead {
@@ -464,6 +476,9 @@ impl FuserState {
         }
     }
 
+    /// Publishes a closed round: the map and the verdicts go to the gateway, the evidence and the
+    /// reputations to the keeper. Entries that were left out are counted first. `None` has no
+    /// effect.
     fn publish(&mut self, fused: Option<Fused>, now: Timestamp) {
         let Some(fused) = fused else { return };
         let _round = self

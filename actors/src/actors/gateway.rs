@@ -291,6 +291,8 @@ impl GatewayState {
         }
     }
 
+    /// Keeps links to exactly these brokers. A link to another broker withdraws the node's status
+    /// and closes in the background; existing links continue.
     fn set_brokers(&mut self, addresses: Vec<BrokerAddress>, myself: &ActorRef<GatewayMessage>) {
         let mut wanted: BTreeSet<_> = addresses.into_iter().collect();
         let gone: Vec<_> = self
@@ -307,6 +309,8 @@ impl GatewayState {
         }
     }
 
+    /// Opens a link with a new id. It connects in a separate task, and its events are messages to
+    /// this actor.
     fn link_to(&mut self, broker: BrokerAddress, myself: &ActorRef<GatewayMessage>) {
         let id = LinkId(self.next_link);
         self.next_link += 1;
@@ -333,6 +337,8 @@ impl GatewayState {
         }
     }
 
+    /// The filters for a new connection to a broker: reports are included only if this node uses
+    /// them there.
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
@@ -356,6 +362,8 @@ impl GatewayState {
         }
     }
 
+    /// Starts or stops receiving reports for display, on links that carry no reports for this node.
+    /// Later connections follow the same setting.
     fn watch_reports(&mut self, wanted: bool) {
         if self.watches_reports == wanted {
             return;
@@ -378,6 +386,8 @@ impl GatewayState {
         }
     }
 
+    /// Replaces the status: it is published on all links, retained, and the last will for later
+    /// connections is derived from it.
     fn set_status(&mut self, status: NodeStatus) {
         let seal = |payload| Bytes::from(self.setup.security.seal(&self.status_topic, payload));
         self.status_payload = seal(encode(&status, self.encoding));
@@ -395,6 +405,8 @@ impl GatewayState {
         );
     }
 
+    /// Encodes, signs if it is a round, seals and sends a message on all links. A payload that
+    /// receivers would refuse is counted and dropped.
     fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
         let path = self.topics.path(topic);
         let mut payload = encode(payload, self.encoding);
@@ -451,6 +463,7 @@ impl GatewayState {
         false
     }
 
+    /// Sends bytes on all links, and counts for each link whether its queue accepted them.
     fn send(&self, topic: &str, payload: &Bytes, retention: Retention) {
         for link in self.links.values() {
             let sent = link.publish(topic, payload, retention);
@@ -462,6 +475,14 @@ impl GatewayState {
         }
     }
 
+    /// Handles an event of a link's task; an event of a closed link is ignored. A new connection
+    /// publishes the status and subscribes before it counts as up. The node's other parts get the
+    /// link's new state if it has changed.
+    ///
+    /// # Example
+    /// The broker of `edge` ends. `Lost(Down)` arrives: the link has no client and its state is
+    /// `Down`. The next attempt is refused, and `Lost(Refused)` arrives: the election uses this
+    /// state as proof that the process has ended.
     fn link_changed(&mut self, LinkEvent { link: id, change }: LinkEvent) {
         let filters = match &change {
             LinkChange::Accepted { .. } => self

@@ -284,6 +284,8 @@ impl MembershipState {
         }
     }
 
+    /// Carries out all outputs of the machine: sends frames, delivers events and starts steps of
+    /// renewals. Then publishes the list of members if it has changed, and the next deadline.
     fn carry_out(&mut self) {
         let mut changed = false;
         while let Some(output) = self.machine.poll() {
@@ -333,6 +335,9 @@ impl MembershipState {
         self.on_renewal_step(step);
     }
 
+    /// Carries out one step of a renewal: sends a message to a node or to all nodes, or runs work
+    /// in another thread, whose outcome comes back as a message. A message to this node itself is
+    /// processed at once. `None` has no effect.
     fn on_renewal_step(&mut self, step: Option<RenewalStep>) {
         match step {
             Some(RenewalStep::Send(to, message)) if to == self.name => {
@@ -359,6 +364,7 @@ impl MembershipState {
         }
     }
 
+    /// Sends a message about a renewed certificate; a message that is too large is counted instead.
     fn send_renewal(&mut self, to: &NodeName, message: &RenewalMessage) {
         match postcard::to_allocvec(message) {
             Ok(body) if body.len() <= MAX_PAYLOAD_BYTES => {
@@ -368,6 +374,7 @@ impl MembershipState {
         }
     }
 
+    /// Publishes the list of living members if it has changed.
     fn publish_members(&self) {
         let members = self.machine.members();
         self.members.send_if_modified(|told| {

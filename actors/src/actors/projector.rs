@@ -178,6 +178,9 @@ impl ProjectorState {
         }
     }
 
+    /// Handles a pose of a moving vehicle, stated for time `at`. A pose without a place in the
+    /// cell's frame, or not later than the last one, is counted; the first reason why a pose has no
+    /// place is logged.
     fn on_pose(&mut self, at: Timestamp, stated: &StatedPose) {
         let Some(poses) = &mut self.poses else { return };
         let is_taken = match stated.in_map(self.origin.as_ref()) {

@@ -223,6 +223,8 @@ impl ReputationKeeperState {
             .resume(&self.arguments.reputations.open().ledger, clock::now());
     }
 
+    /// Starts a leadership whose rounds begin after `last_round`. In VOTE's `paper` mode the
+    /// reputations of the previous leader are adopted first.
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self
             .arguments
@@ -245,6 +247,8 @@ impl ReputationKeeperState {
         self.last_round = last_round;
     }
 
+    /// Records the evidence of a round of the own leadership, and publishes the shares that are
+    /// due.
     fn record(
         &mut self,
         epoch: &Epoch,
@@ -265,6 +269,15 @@ impl ReputationKeeperState {
         self.publish_shares(shares);
     }
 
+    /// Handles a share of another candidate. The share is checked in this order: its path over the
+    /// broker, its signature, its plausibility. Accepted evidence is stored and passed to the fuser
+    /// at the next tick. The election is notified if the broker vouches for the sender. Refused
+    /// shares are counted by reason.
+    ///
+    /// # Example
+    /// `gauss` prepares to take over from `edge`. `edge` shares all its evidence, signed. The share
+    /// arrives over the broker of `edge`: it is merged, and the election gets `EvidenceReceived`,
+    /// so that `gauss` may answer `Ready`.
     fn merge(&mut self, delivery: &Delivery<Arc<LedgerShare>>) {
         let share = &delivery.message;
         let candidates = self.candidates();
@@ -334,6 +347,8 @@ impl ReputationKeeperState {
             .collect()
     }
 
+    /// Ends probations of evidence that are over, settles pending changes, and publishes the shares
+    /// that are due.
     async fn tick(&mut self) {
         let leadership = self.arguments.leadership.borrow().clone();
         let passed = self.resync.tick(
@@ -390,6 +405,7 @@ impl ReputationKeeperState {
             });
     }
 
+    /// Publishes all evidence in shares; every candidate gets them.
     fn send_snapshot(&mut self) {
         let shares = self
             .resync
@@ -441,6 +457,8 @@ impl ReputationKeeperState {
         has_dropped
     }
 
+    /// Saves the store if it has changed, and records a failure as a trouble until a later attempt
+    /// succeeds.
     async fn save(&mut self) {
         let arguments = &self.arguments;
         let outcome = self

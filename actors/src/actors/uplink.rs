@@ -208,6 +208,8 @@ impl UplinkState {
         self.publish_map();
     }
 
+    /// Opens a connection to the region's broker for the cell in this tile. Messages and events
+    /// come back as messages to the actor.
     fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
         let receiver = myself.clone();
         // An uplink that has ended needs no events.
@@ -244,6 +246,7 @@ impl UplinkState {
         )
     }
 
+    /// Closes a link in the background, after a last status unless another node leads already.
     fn leave(&mut self, link: RegionLink) {
         let last = self.farewell();
         tokio::spawn(async move { link.close(last.as_ref()).await });

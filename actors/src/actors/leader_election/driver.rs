@@ -120,6 +120,10 @@ impl ElectionDriver {
         }
     }
 
+    /// Handles an event of the membership. Most events become an input of the leadership. A
+    /// datagram is decoded first; a false sign of life or an invalid message is counted and
+    /// dropped, and stamps for the cell's time and the description are passed to their parts. An
+    /// expelled node and a change of this machine's address concern other actors.
     pub(super) async fn on_membership_event(&mut self, event: MembershipEvent) {
         if let MembershipEvent::Alive { member } | MembershipEvent::Changed { member } = &event {
             self.life_signs
@@ -212,6 +216,12 @@ impl ElectionDriver {
     }
 
     /// Passes an input to the leadership, and carries out its effects before the next input.
+    ///
+    /// # Example
+    /// The timer fires: the input is [`Input::Wake`]. The leadership returns a beat for `gauss`,
+    /// which goes to the membership, and [`Effect::Look`], whose answers are the inputs
+    /// [`Input::Looked`] and [`Input::Telling`]. Both are processed, and the timer is set for the
+    /// next deadline.
     pub(super) async fn handle(&mut self, input: Input) {
         if input == Input::Wake {
             self.alarm = Timestamp(u64::MAX);
@@ -441,6 +451,8 @@ impl ElectionDriver {
         }
     }
 
+    /// Sets the timer for the leadership's next deadline, in place of the timer that was set
+    /// before.
     fn set_timer(&mut self) {
         let due = self.machine.next_deadline();
         if due == self.alarm {
@@ -560,6 +572,7 @@ fn clock_remedy(clock: &WrongClock<'_>) -> &'static str {
     }
 }
 
+/// Logs a step of a clock.
 fn log_clock(event: ClockEvent) {
     let seconds = |micros: i64| micros as f64 / 1e6;
     match event {
@@ -572,6 +585,7 @@ fn log_clock(event: ClockEvent) {
     };
 }
 
+/// Logs a notice of the leadership, at the level that it has for the operator.
 fn log(notice: Notice) {
     match notice {
         Notice::Fit => tracing::info!("this node's parts work: it can lead"),

@@ -109,6 +109,8 @@ impl TermWriter {
     }
 }
 
+/// Writes the newest term whenever it changes, and answers with the result. A term that a newer one
+/// replaces during a write is skipped.
 async fn write_all(
     file: StateFile,
     mut terms: watch::Receiver<u64>,

@@ -181,6 +181,9 @@ impl Renewals {
         }
     }
 
+    /// Handles the request of a node, or of this node itself, for a renewed certificate. Only a
+    /// node that has the key of the CA and a correct clock answers. A repeated request gets the
+    /// same certificate again; a request that is being processed is ignored.
     fn on_request(
         &mut self,
         from: NodeName,

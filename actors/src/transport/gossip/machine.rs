@@ -181,7 +181,13 @@ impl GossipMachine {
             .collect()
     }
 
-    /// Processes a datagram.
+    /// Handles a datagram: opens and checks the frame, and handles its content. A refused frame is
+    /// counted by its reason. Outputs are available from [`Self::poll`].
+    ///
+    /// # Example
+    /// `Hello` of the new node `gauss` arrives: the output is a challenge with a cookie. `Proof`
+    /// with this cookie arrives: the outputs are `Accept` and the event that `gauss` is alive. A
+    /// `Proof` with another cookie is counted as [`FrameEvent::Replayed`].
     pub(crate) fn receive(&mut self, datagram: &[u8], from: SocketAddr, now: Timestamp) {
         let at = self.advance(now);
         self.counters.count(FrameEvent::Received);
@@ -246,6 +252,9 @@ impl GossipMachine {
         self.send_as(FrameKind::Renewal, to, body, now);
     }
 
+    /// Sends a frame of this kind to a living or recently active node, or queues it until the
+    /// handshake with the node is complete. Without an address it is counted as
+    /// [`FrameEvent::NoSession`].
     fn send_as(&mut self, kind: FrameKind, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
         let address = self
@@ -324,6 +333,11 @@ impl GossipMachine {
         }
     }
 
+    /// Handles the content of an authentic frame: answers and greetings are queued, gossip goes to
+    /// SWIM, payloads and renewals become outputs.
+    ///
+    /// # Errors
+    /// Returns the event under which refused gossip is counted.
     fn on_opened_frame(
         &mut self,
         opened: FrameContent,
@@ -565,6 +579,8 @@ impl GossipMachine {
         self.hello_at = at + self.hello * percent / 100;
     }
 
+    /// Reports a second node of a name as a trouble, once it has been there for [`TAKEN_TIME`], and
+    /// then at most once per [`REPORT_INTERVAL`].
     fn report_taken(&mut self, name: &NodeName, cause: String, at: Timestamp) {
         self.taken
             .retain(|_, taken| at.since(taken.last) < NAME_PATIENCE);

@@ -292,6 +292,9 @@ impl Swim {
         self.collect(now);
     }
 
+    /// Moves the outputs of foca to this machine: datagrams, timers in order of their time, and
+    /// notifications. The timer that will declare a node down also yields the suspicion of that
+    /// node.
     fn collect(&mut self, now: Timestamp) {
         while let Some((to, body)) = self.runtime.to_send() {
             self.outputs.push_back(SwimOutput::Send {
@@ -318,6 +321,9 @@ impl Swim {
         }
     }
 
+    /// Handles a notification of foca: members that came up, went down or changed become outputs.
+    /// If the other nodes have declared this node down, it renews its identity, at most once per
+    /// [`MIN_RENEW_INTERVAL`].
     fn on_notification(&mut self, notification: OwnedNotification<NodeId>, now: Timestamp) {
         match notification {
             OwnedNotification::MemberUp(id) => {
