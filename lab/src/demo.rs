@@ -40,9 +40,9 @@ use crate::testbed::{Cav, Scene, Testbed, frames, setup};
 pub struct Demo<'a> {
     /// The program that is run as every node.
     pub program: &'a Path,
-    /// Camera and placards.
+    /// The camera and the placards of the scenes.
     pub testbed: &'a Testbed,
-    /// The scene.
+    /// The scene that is run.
     pub scene: &'a Scene,
     /// Time for which the maps are evaluated.
     pub duration: Duration,
@@ -55,7 +55,7 @@ pub struct Demo<'a> {
 /// Result of one scene, with the data for its drawing.
 #[derive(Debug, Clone)]
 pub struct DemoResult {
-    /// Accuracies.
+    /// Shares of spots and verdicts that were right.
     pub result: SceneResult,
     /// Number of maps that at least one vehicle received.
     pub maps: usize,
@@ -63,9 +63,9 @@ pub struct DemoResult {
     pub missed: usize,
     /// Time from the capture of the oldest report in a map to its receipt by a vehicle, median.
     pub median_age: Duration,
-    /// The last map.
+    /// The last map that a vehicle received; `None` if there was no map.
     pub last_map: Option<GlobalMap>,
-    /// The vehicles' reports.
+    /// All reports in the order of their receipt.
     pub reports: Vec<ObservedReport>,
     /// Time from which on the maps are evaluated.
     pub from: Timestamp,

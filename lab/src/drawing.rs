@@ -3,7 +3,6 @@
 use svg::Document;
 use svg::node::element::Rectangle;
 
-/// Colour of texts.
 pub(crate) const INK: &str = "#222222";
 /// Fonts of texts; the first available one is used.
 pub(crate) const FONT: &str = "DejaVu Sans, Verdana, Helvetica, Arial, sans-serif";

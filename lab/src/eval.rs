@@ -79,7 +79,7 @@ pub struct Scores {
 pub struct ClassRecall {
     /// The first accepted label; null if no object stands there.
     pub truth: Option<Label>,
-    /// Items.
+    /// Number of items of this class.
     pub items: u64,
     /// Share of right items in percent.
     pub recall_pct: Option<f64>,
@@ -90,7 +90,7 @@ pub struct ClassRecall {
 pub struct RoundScores {
     /// Entries with a truth.
     pub entries: u64,
-    /// Right ones.
+    /// Number of entries that agree with their truth.
     pub right: u64,
     /// Share of right entries in percent.
     pub accuracy_pct: Option<f64>,
@@ -103,7 +103,7 @@ pub struct ConfusionCell {
     pub truth: Option<Label>,
     /// The given label; null without a label.
     pub said: Option<Label>,
-    /// Items.
+    /// Number of items in this cell.
     pub count: u64,
 }
 

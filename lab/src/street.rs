@@ -31,7 +31,7 @@ const CODE_MODULES: usize = 21;
 pub struct Street {
     /// People, cars, and bodies without a label: houses and a kiosk.
     pub bodies: Vec<StreetBody>,
-    /// The cameras.
+    /// All cameras, each with its node.
     pub cameras: Vec<StreetCamera>,
 }
 
@@ -64,7 +64,7 @@ struct Solid {
 pub struct StreetCamera {
     /// Name of its node.
     pub name: NodeName,
-    /// Where it is.
+    /// Body or mast on which the camera is mounted.
     pub carrier: Carrier,
     /// Its height and angles.
     pub mount: Mount,
@@ -75,7 +75,7 @@ pub struct StreetCamera {
 pub enum Carrier {
     /// On the middle of this body, which it does not see.
     Body(usize),
-    /// On a mast.
+    /// On a mast with this pose.
     Mast(Pose),
 }
 

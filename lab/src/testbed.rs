@@ -118,7 +118,7 @@ pub struct Placard {
 pub struct Scene {
     /// The scene's name, unique in its file.
     pub name: String,
-    /// The parking spots.
+    /// The parking spots, free or occupied.
     pub spots: Vec<Spot>,
     /// The vehicles that watch them.
     pub cavs: Vec<Cav>,
@@ -136,7 +136,7 @@ impl Scene {
     }
 }
 
-/// One parking spot.
+/// One parking spot with its truth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spot {
     /// `slot-` and the spot's number or name in the file.
@@ -198,7 +198,7 @@ pub struct Card {
 /// One vehicle that watches the spots.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cav {
-    /// The vehicle's name.
+    /// Name of the vehicle, by which it reports.
     pub name: NodeName,
     /// Where its camera is and looks.
     pub pose: Pose,

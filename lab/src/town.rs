@@ -54,7 +54,7 @@ const JOIN_TIME: Duration = Duration::from_secs(1);
 /// Maximum time between a map and the moment that it represents.
 const MOMENT: Duration = Duration::from_millis(75);
 
-/// Links between cells.
+/// Simulated links between cells, over which maps are exchanged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LinkConfig {
     /// Maps a second that a cell sends.
@@ -84,7 +84,7 @@ impl Default for LinkConfig {
 /// Accuracy of one method of making the town's map.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TownScores {
-    /// Everywhere.
+    /// Scores of all objects, wherever they are.
     pub all: TrackScores,
     /// Within [`BORDER_M`] of a border.
     pub border: TrackScores,
@@ -98,7 +98,7 @@ pub struct TownScores {
 pub struct TownResult {
     /// One aggregator over everything.
     pub single: TownScores,
-    /// The cells together.
+    /// The maps of the cells put together.
     pub cells: TownScores,
     /// Number of identities in maps of the cells.
     pub identities: usize,

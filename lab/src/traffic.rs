@@ -74,7 +74,7 @@ pub struct ArrivedReport {
     /// Time of arrival; absent if reports arrive at once.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub received_at_us: Option<Timestamp>,
-    /// The report.
+    /// The report as its vehicle made it.
     #[serde(flatten)]
     pub report: ObjectReport,
 }
@@ -86,10 +86,10 @@ pub struct TrafficTruth {
     pub frames: Vec<TruthFrame>,
 }
 
-/// One moment.
+/// All objects at one moment.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TruthFrame {
-    /// The moment.
+    /// Time of the moment in µs, on the clock of the reports.
     pub t_us: Timestamp,
     /// Objects that were there.
     pub objects: Vec<TruthObject>,
@@ -100,7 +100,7 @@ pub struct TruthFrame {
 pub struct TruthObject {
     /// Constant over all frames.
     pub id: usize,
-    /// Its class.
+    /// Class of the object.
     pub label: &'static str,
     /// East of its centre in metres.
     pub x_m: f64,

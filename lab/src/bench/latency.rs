@@ -19,7 +19,7 @@ pub struct Latencies {
 /// Latencies of one kind of answer.
 #[derive(Debug, Clone, Default)]
 pub struct Answers {
-    /// As maps.
+    /// Latencies of the answers as maps.
     pub map: Latencies,
     /// Latencies as verdicts; empty in a cell without votes.
     pub verdict: Latencies,
@@ -34,7 +34,7 @@ pub struct Quantiles {
     pub p99_us: f64,
     /// 999 of 1000 take at most as many microseconds.
     pub p999_us: f64,
-    /// Number of answers.
+    /// Number of answers, missing ones included.
     pub n: u64,
     /// Number of missing answers.
     pub missing: u64,

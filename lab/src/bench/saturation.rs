@@ -31,7 +31,7 @@ pub struct Step {
     pub refused: u64,
     /// Most time in milliseconds by which sending began late.
     pub sent_late_ms: f64,
-    /// Use of processors.
+    /// Use of processors by aggregator and vehicles.
     pub shares: Shares,
 }
 
@@ -40,7 +40,7 @@ pub struct Step {
 pub struct Shares {
     /// Of an aggregator that is watched.
     pub aggregator: Option<AggregatorShares>,
-    /// The simulated vehicles.
+    /// Processor time of the simulated vehicles, all together.
     pub vehicles: f64,
 }
 

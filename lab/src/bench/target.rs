@@ -11,11 +11,11 @@ use super::access::BrokerAccess;
 pub struct Target {
     /// Where its data goes.
     pub access: BrokerAccess,
-    /// Its name.
+    /// Name of the cell, by which its topics are named.
     pub cell: NodeName,
-    /// The cell's landmarks.
+    /// Landmarks of the cell, at which the simulated vehicles report objects.
     pub landmarks: Vec<LandmarkConfig>,
-    /// Encoding of reports.
+    /// Encoding in which reports are sent.
     pub encoding: Encoding,
     /// True if its rounds make verdicts.
     pub votes: bool,

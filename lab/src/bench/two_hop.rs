@@ -40,19 +40,19 @@ pub enum TwoHopError {
     /// A connection could not be made or broke.
     #[error("connection to {broker}: {source}")]
     Connection {
-        /// The broker.
+        /// Address of the broker.
         broker: BrokerAddress,
-        /// Cause.
+        /// Reason why the connection failed.
         source: Box<rumqttc::ConnectionError>,
     },
     /// The broker did not answer or lost a message.
     #[error("{missing} of {messages} messages did not come back from {broker}")]
     Missing {
-        /// The broker.
+        /// Address of the broker.
         broker: BrokerAddress,
         /// Messages that are missing.
         missing: u32,
-        /// Messages sent.
+        /// Number of messages that were sent.
         messages: u32,
     },
 }

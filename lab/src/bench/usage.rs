@@ -24,7 +24,7 @@ pub struct Usage {
 }
 
 impl UsageMeter {
-    /// Counts from now.
+    /// Starts to measure the process with this id.
     pub fn start(pid: u32) -> Self {
         Self {
             pid,

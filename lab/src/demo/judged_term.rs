@@ -11,7 +11,7 @@ use ecod_actors::messages::newest::ReceivedMap;
 /// A leadership as observed by the vehicles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JudgedTerm {
-    /// Leader and term.
+    /// Leader and term of the leadership.
     pub epoch: Epoch,
     /// Time when the first vehicle accepted the first map.
     pub from: Timestamp,

@@ -18,7 +18,7 @@ use uuid::Uuid;
 /// A report and its time of receipt.
 #[derive(Debug, Clone)]
 pub struct ObservedReport {
-    /// The report.
+    /// The report as it was received.
     pub report: Arc<ObjectReport>,
     /// Time of receipt by this process's clock.
     pub received_at: Timestamp,

@@ -57,7 +57,7 @@ pub struct StreetDemo<'a> {
 /// Result of a run.
 #[derive(Debug)]
 pub struct StreetOutcome {
-    /// Figures.
+    /// Figures of the run, as the command prints them.
     pub result: StreetResult,
     /// Time from which on the maps are evaluated.
     pub from: Timestamp,
@@ -74,7 +74,7 @@ pub struct StreetResult {
     pub alone: BTreeMap<NodeName, KnownShare>,
     /// Each node with the cell: its knowledge from the maps that it received.
     pub with_cell: BTreeMap<NodeName, KnownShare>,
-    /// Leaders in order.
+    /// All leaders in the order of their terms.
     pub leaders: Vec<NodeName>,
     /// The node that led after the edge was killed; null if there was no such node.
     pub took_over: Option<NodeName>,

@@ -88,9 +88,9 @@ struct ParsedFile {
 /// Entries of a file that state no usable object.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SkippedEntries {
-    /// How many.
+    /// Number of these entries.
     pub count: u64,
-    /// The first with its fault.
+    /// The first of them as text, with its fault.
     pub first: String,
 }
 
@@ -125,7 +125,7 @@ pub struct Sequence {
     pub name: String,
     /// Number of the first frame.
     pub first: u64,
-    /// Its frames.
+    /// Objects by the number of the frame.
     pub frames: Frames,
     /// The pose of the camera that placed the objects; it stands.
     pub pose: Option<WirePose>,
@@ -177,7 +177,7 @@ pub struct LineError {
     pub line: usize,
     /// The column and its expected content.
     pub field: String,
-    /// The fault.
+    /// Fault of the column as text.
     pub fault: String,
 }
 
@@ -480,7 +480,6 @@ impl<'a> Cells<'a> {
         self.cells.get(column - 1).copied().ok_or_else(missing)
     }
 
-    /// A finite number.
     fn number(&self, column: usize, name: &str) -> Result<f64, LineError> {
         let text = self.text(column, name)?;
         let number = text.parse().ok().filter(|number: &f64| number.is_finite());

@@ -19,7 +19,7 @@ use super::reliability::{JudgedStatement, Reliability};
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 const ROUND: Duration = Duration::from_millis(100);
 
-/// One answer.
+/// One voter's answer about an item.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoterAnswer {
     /// Index of the voter.
@@ -57,7 +57,7 @@ pub enum LabelSetError {
     Confidence {
         /// Line of the file, from 1.
         line: u64,
-        /// The cell.
+        /// Content of the cell.
         text: String,
     },
     /// A required cell is empty.
@@ -65,7 +65,7 @@ pub enum LabelSetError {
     Empty {
         /// Line of the file, from 1.
         line: u64,
-        /// The column.
+        /// Name of the column.
         column: &'static str,
     },
     /// Two truths of one item differ.
@@ -73,7 +73,7 @@ pub enum LabelSetError {
     TwoTruths {
         /// Line of the file, from 1.
         line: u64,
-        /// The item.
+        /// Name of the item.
         item: String,
     },
     /// There are more labels than VOTE takes.
@@ -145,7 +145,7 @@ impl LabelSet {
             .count()
     }
 
-    /// Number of answers.
+    /// Number of answers about all items.
     pub fn answers(&self) -> usize {
         self.items.iter().map(|item| item.answers.len()).sum()
     }

@@ -29,11 +29,11 @@ pub struct Reliability {
 /// Objects of which nearly the same probability was stated.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ReliabilityBin {
-    /// Their mean probability.
+    /// Mean of the stated probabilities in percent.
     pub stated_pct: f64,
     /// The share of them that is right.
     pub right_pct: f64,
-    /// Their number.
+    /// Number of objects in the bin.
     pub objects: u64,
 }
 

@@ -64,18 +64,18 @@ pub struct ScoredFrame {
     pub said: Vec<SaidObject>,
 }
 
-/// A true object.
+/// An object of the truth in one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueObject {
     /// Its identity; small numbers, they count places in tables.
     pub id: u32,
-    /// Its class.
+    /// Class of the object.
     pub label: Label,
     /// Its centre in metres.
     pub position: Point2<f64>,
 }
 
-/// A reported object.
+/// An object of a map in one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SaidObject {
     /// The identity it was given; small numbers, they count places in tables.
@@ -126,7 +126,7 @@ pub struct TrackScores {
     pub best_moda_pct: [Option<f64>; AP_DISTANCES_M.len()],
     /// At the threshold of the greatest F1.
     pub at_best_f1: ThresholdScores,
-    /// At [`DEFAULT_THRESHOLD`].
+    /// Figures at [`DEFAULT_THRESHOLD`].
     pub at_default: ThresholdScores,
     /// Calibration of the stated probabilities, independent of the threshold.
     pub calibration: ReliabilityBins,
@@ -136,7 +136,7 @@ pub struct TrackScores {
 /// classes together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThresholdScores {
-    /// The threshold.
+    /// Least confidence of the objects that count.
     pub threshold: f64,
     /// Reported objects that matched a true one.
     pub matches: u64,
@@ -326,7 +326,7 @@ impl TrackEvaluation {
         are_apart.then(|| (listed(&said), listed(&truth)))
     }
 
-    /// The figures.
+    /// Computes the figures from all frames.
     pub fn result(self) -> TrackScores {
         let with_map = self.maps.iter().flatten().count() as u64;
         let frames: Vec<ScoredFrame> = self

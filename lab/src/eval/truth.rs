@@ -53,9 +53,9 @@ pub enum TruthError {
     /// A location's truth has an invalid form.
     #[error("truth of `{landmark}` {reason}")]
     Location {
-        /// The location.
+        /// Name of the location.
         landmark: String,
-        /// Reason.
+        /// Reason why its truth cannot be used, as a predicate.
         reason: String,
     },
     /// No location at all.

@@ -31,7 +31,6 @@ pub(super) struct Votes {
     items: BTreeMap<Item, BTreeMap<NodeName, Ballot>>,
 }
 
-/// Votes by label.
 type Ballot = BTreeMap<Label, Said>;
 
 #[derive(Debug, Clone, Copy, Default)]

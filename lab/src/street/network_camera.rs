@@ -20,7 +20,7 @@ use super::view::StreetView;
 use super::{Street, StreetCamera};
 use crate::testbed::camera::sensor::Sensor;
 
-/// Pictures a second.
+/// Number of pictures that the camera sends per second.
 pub const FRAMES_PER_S: f64 = 5.0;
 
 /// Quality of the sent pictures.
@@ -100,7 +100,7 @@ impl NetworkCamera {
         })
     }
 
-    /// The camera's address.
+    /// Address from which the camera's pictures are read.
     pub fn url(&self) -> String {
         format!("http://{}/video", self.address)
     }

@@ -10,7 +10,6 @@ const HALF_CHORD_M: f64 = 0.4;
 /// Where something is at every time.
 #[derive(Debug, Clone)]
 pub(super) enum Route {
-    /// It stays.
     Stands(Pose),
     /// Around a closed way at a constant speed.
     Loop {

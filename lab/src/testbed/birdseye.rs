@@ -46,21 +46,21 @@ pub enum BirdseyeError {
     /// A detection names a vehicle that the scene does not have.
     #[error("scene {scene} has no vehicle {node}, which a detection names")]
     Stranger {
-        /// The scene's name.
+        /// Name of the scene.
         scene: String,
-        /// The vehicle.
+        /// Name of the vehicle.
         node: NodeName,
     },
     /// A detection's place is not a number.
     #[error("a detection of {node} is at a place that is not finite")]
     Detection {
-        /// The vehicle.
+        /// Name of the vehicle.
         node: NodeName,
     },
     /// A fused place is not a number.
     #[error("the map has {landmark} at a place that is not finite")]
     Landmark {
-        /// The landmark.
+        /// Name of the landmark.
         landmark: LandmarkId,
     },
 }

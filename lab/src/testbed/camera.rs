@@ -78,7 +78,7 @@ pub enum RenderError {
     /// A placard's text does not fit into a code.
     #[error("text {text:?} does not fit into a qr code")]
     Text {
-        /// The text.
+        /// Text of the placard.
         text: Label,
         /// The encoder's own words.
         #[source]
@@ -87,9 +87,9 @@ pub enum RenderError {
     /// OpenCV refused an operation.
     #[error("opencv failed in {step}")]
     OpenCv {
-        /// Step that failed.
+        /// Name of the operation that failed.
         step: &'static str,
-        /// OpenCV's own words.
+        /// The error that OpenCV returned.
         #[source]
         source: opencv::Error,
     },

@@ -75,7 +75,7 @@ const MAX_HEIGHT_FACTOR: f64 = 5.0;
 /// Result of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct IntersectionResult {
-    /// The scene's name.
+    /// Name of the recording or scene.
     pub name: String,
     /// Number of scenes that it is the mean of: 1 for a recording.
     pub scenes: u64,
@@ -98,12 +98,12 @@ pub struct IntersectionResult {
     pub labels: Vec<FrameLabel>,
 }
 
-/// One verdict.
+/// The verdict about one object in one frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameLabel {
     /// The frame, from 1.
     pub frame: u64,
-    /// The location.
+    /// Name of the object's location.
     pub landmark: LandmarkId,
     /// The verdict; null without a verdict.
     pub label: Option<Label>,

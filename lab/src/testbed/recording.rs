@@ -28,7 +28,7 @@ pub struct IntersectionRecording {
     pub intrinsics: Intrinsics,
     /// Objects and their places.
     pub objects: Vec<KnownObject>,
-    /// The vehicles.
+    /// The vehicles that watch the objects.
     pub cavs: Vec<Cav>,
     /// The frames of each vehicle, in the order of `cavs`; some may have fewer.
     pub frames: Vec<Vec<Vec<Detection>>>,

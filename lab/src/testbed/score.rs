@@ -95,7 +95,7 @@ pub(super) fn is_right(testbed: &Testbed, spot: &Spot, state: &LandmarkState) ->
 /// Result of one scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SceneResult {
-    /// The scene's name.
+    /// Name of the scene.
     pub name: String,
     /// Number of fused maps that were evaluated.
     pub verdicts: u64,

@@ -24,9 +24,9 @@ use crate::testbed::{Cav, Scene, Testbed};
 /// One scene to be run.
 #[derive(Debug, Clone, Copy)]
 pub struct Trial<'a> {
-    /// Camera and placards.
+    /// The camera and the placards of the scenes.
     pub testbed: &'a Testbed,
-    /// The scene.
+    /// The scene that is run.
     pub scene: &'a Scene,
     /// Number of fused maps to evaluate.
     pub verdicts: u64,
@@ -154,7 +154,7 @@ impl Trial<'_> {
             .collect()
     }
 
-    /// One vehicle's reports.
+    /// The reports of one vehicle from all its frames.
     fn watch(&self, cav: &Cav, progress: &impl Fn()) -> anyhow::Result<Vec<ObjectReport>> {
         let camera = TestbedCamera::new(self.testbed, self.scene, cav, self.seed)?;
         let mut detector = PlacardDetector::new(PlacardConfig::default());

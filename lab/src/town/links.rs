@@ -10,7 +10,6 @@ use ecod::wire::{CellMap, RegionTopic};
 use super::LinkConfig;
 use super::cell::TownCell;
 
-/// Maps in transit.
 pub(super) struct TownLinks<'a> {
     config: LinkConfig,
     uniform: &'a mut dyn FnMut() -> f64,

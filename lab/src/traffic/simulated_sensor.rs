@@ -34,7 +34,7 @@ const CONFUSED: f64 = 0.05;
 pub(super) struct SimulatedSensor {
     offset: [Drift; 2],
     turn: Drift,
-    /// By body.
+    /// Index: number of the body.
     glances: Vec<Glance>,
     ghosts: Vec<Ghost>,
     last_s: f64,

@@ -61,7 +61,6 @@ impl Walker {
         }
     }
 
-    /// The current speed.
     pub(super) fn speed_mps(&self) -> f64 {
         if self.pauses_for_s > 0.0 {
             0.0

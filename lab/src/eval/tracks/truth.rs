@@ -29,7 +29,6 @@ pub struct TrackTruth {
     has_identities: bool,
 }
 
-/// One moment.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct TrueFrame {
     pub(super) at: Timestamp,
@@ -44,7 +43,7 @@ pub enum TrackTruthError {
     Form {
         /// The path of the value, as `frames[3].objects[0].x_m`.
         place: String,
-        /// Reason.
+        /// Reason why the value cannot be used.
         reason: String,
     },
     /// No frame at all, or no object in the files of a benchmark.

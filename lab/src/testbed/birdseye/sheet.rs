@@ -78,7 +78,7 @@ impl Sheet {
         )
     }
 
-    /// Metres in pixels.
+    /// A length in pixels, from metres.
     pub(super) fn length(&self, metres: f64) -> f64 {
         metres * self.px_per_m
     }
