@@ -71,7 +71,7 @@ impl RegionPage {
         self.address
     }
 
-    /// Serves without end.
+    /// Serves the page; the future does not end.
     pub async fn serve(self) {
         let router = routes::router(&self.api, self.access);
         let limit = ConnectionLimit::new(MAX_CONNECTIONS);

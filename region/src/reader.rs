@@ -40,9 +40,9 @@ pub struct BrokerLink {
 /// A message and its outcome.
 #[derive(Debug)]
 pub struct Reading<'a> {
-    /// Its topic.
+    /// Topic of the message.
     pub topic: &'a str,
-    /// Its payload.
+    /// Payload of the message as received.
     pub payload: &'a [u8],
     /// When it was read.
     pub at: Timestamp,
@@ -61,12 +61,12 @@ const RETRY_MAX: Duration = Duration::from_secs(5);
 const CONNECT_TIMEOUT_S: u64 = 10;
 
 impl RegionState {
-    /// The town.
+    /// Locks the town until the guard is dropped.
     pub fn town(&self) -> MutexGuard<'_, RegionTown> {
         self.town.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The connection.
+    /// State of the connection to the broker.
     pub fn link(&self) -> BrokerLink {
         lock(&self.link).clone()
     }

@@ -50,7 +50,7 @@ pub struct RegionCell {
 /// Messages and objects of one cell that were not used, so far.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct CellLosses {
-    /// Messages beyond [`MAX_MAP_HZ`].
+    /// Messages beyond the rate of [`MAX_MAP_HZ`].
     pub throttled: u64,
     /// Objects outside of the area that the cell may report.
     pub outside: u64,
@@ -63,7 +63,7 @@ pub struct CellLosses {
 pub struct TownMap {
     /// The place on Earth of its frame.
     pub origin: GeographicOrigin,
-    /// The leader.
+    /// Name of the leader that fused the map.
     pub aggregator: NodeName,
     /// Term of the leadership.
     pub epoch: u64,
@@ -77,14 +77,14 @@ pub struct TownMap {
     pub sent_at: Timestamp,
 }
 
-/// Messages so far.
+/// Numbers of the messages so far.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TownCounts {
-    /// All messages.
+    /// Number of all messages.
     pub messages: u64,
     /// Bytes of their payloads.
     pub bytes: u64,
-    /// Maps that count.
+    /// Number of accepted maps.
     pub maps: u64,
     /// Refused messages, by reason; maps that are too old are `Stale`.
     pub rejected: BTreeMap<RejectReason, u64>,
@@ -131,7 +131,7 @@ pub enum CellState {
 }
 
 impl CellState {
-    /// All states.
+    /// All states in order of declaration.
     pub const ALL: [Self; 4] = [Self::Live, Self::Told, Self::Silent, Self::Offline];
 
     /// The state in metrics and on the page.
@@ -264,7 +264,7 @@ impl RegionTown {
         &self.cells
     }
 
-    /// Messages so far.
+    /// Numbers of the messages so far.
     pub fn counts(&self) -> &TownCounts {
         &self.counts
     }

@@ -90,7 +90,6 @@ impl Cluster {
         Ok(Self { directory, servers })
     }
 
-    /// Where cells connect.
     pub(crate) fn addresses(&self) -> Vec<SocketAddr> {
         self.servers
             .iter()

@@ -152,7 +152,6 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// All that runs.
 struct City {
     watches: [Watch; 2],
     fleet: Fleet,

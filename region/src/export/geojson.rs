@@ -6,11 +6,11 @@ use serde_json::{Map, Value, json};
 
 use crate::town::{GeographicBounds, RegionTown, TownView};
 
-/// A GeoJSON document.
+/// A collection of features, the document that GeoJSON viewers read.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FeatureCollection {
     r#type: &'static str,
-    /// The features.
+    /// The features, each with `kind` in its properties.
     pub features: Vec<Value>,
 }
 

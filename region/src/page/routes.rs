@@ -48,7 +48,7 @@ const MAX_TILES_OF_VIEW: usize = 16;
 /// Maximum length of a viewer's name.
 const MAX_NAME_BYTES: usize = 64;
 
-/// The whole map.
+/// Bounds of the map's projection in degrees.
 const EARTH: GeographicBounds = GeographicBounds {
     west: -180.0,
     south: -85.06,

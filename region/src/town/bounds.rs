@@ -8,13 +8,13 @@ use serde::Serialize;
 /// A rectangle in degrees of latitude and longitude.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct GeographicBounds {
-    /// West edge.
+    /// Longitude of the west edge in degrees.
     pub west: f64,
-    /// South edge.
+    /// Latitude of the south edge in degrees.
     pub south: f64,
-    /// East edge.
+    /// Longitude of the east edge in degrees.
     pub east: f64,
-    /// North edge.
+    /// Latitude of the north edge in degrees.
     pub north: f64,
 }
 

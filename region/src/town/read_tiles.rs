@@ -33,7 +33,7 @@ impl ReadTiles {
         self.0.clear();
     }
 
-    /// Number of tiles.
+    /// Number of tiles that are read.
     pub fn count(&self) -> usize {
         self.0.len()
     }

@@ -31,10 +31,10 @@ pub struct TownView {
     pub objects: Vec<ObjectView>,
 }
 
-/// Numbers of cells.
+/// Numbers of cells and of the objects of their maps.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct TownTotals {
-    /// All cells.
+    /// Number of all cells.
     pub cells: usize,
     /// Cells whose newest map is not old.
     pub live: usize,
@@ -48,16 +48,16 @@ pub struct TownTotals {
     pub troubled: usize,
     /// Objects of live cells.
     pub objects: usize,
-    /// Vehicles among them.
+    /// Objects that are vehicles of their cell.
     pub vehicles: usize,
 }
 
 /// A tile and its contents.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TileView {
-    /// Its quadkey.
+    /// Quadkey of the tile.
     pub key: String,
-    /// Where it is.
+    /// Bounds of the tile.
     pub bounds: GeographicBounds,
     /// The cells in it.
     pub totals: TownTotals,
@@ -65,20 +65,20 @@ pub struct TileView {
     pub oldest_s: Option<f64>,
 }
 
-/// A cell.
+/// A cell in the form for the page.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TownCellView {
-    /// Its name.
+    /// Name of the cell.
     pub cell: NodeName,
     /// The quadkey of its tile.
     pub tile: String,
     /// Latitude of its origin in degrees; before a map has arrived, of the middle of its tile.
     pub latitude_deg: f64,
-    /// Longitude in degrees.
+    /// Longitude of the same place in degrees.
     pub longitude_deg: f64,
     /// Its state: `live`, `told`, `silent` or `offline`.
     pub state: &'static str,
-    /// Its leader.
+    /// Name of the leader; `None` if map and status name no leader.
     pub leader: Option<NodeName>,
     /// Term of the leadership.
     pub epoch: Option<u64>,
@@ -107,11 +107,11 @@ pub struct TownCellView {
 /// An object of a cell's map.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ObjectView {
-    /// Its identity.
+    /// Identity of the object in the map of its cell.
     pub id: Uuid,
     /// The cell whose map contains the object.
     pub cell: NodeName,
-    /// Its label.
+    /// Label of the object.
     pub label: Label,
     /// The probability that the object exists.
     pub confidence: f64,
@@ -281,7 +281,7 @@ fn vehicles(objects: &[FusedObject]) -> usize {
 }
 
 impl TownMap {
-    /// Age in seconds.
+    /// Age of the map in seconds, from its sending to `now`.
     pub fn age_s(&self, now: Timestamp) -> f64 {
         now.since(self.sent_at).as_secs_f64()
     }
