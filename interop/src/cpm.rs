@@ -88,7 +88,7 @@ pub struct ReceivedCpm {
 /// A message that cannot be written or used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum CpmError {
-    /// More than [`MAX_BYTES`].
+    /// The message has more than [`MAX_BYTES`] bytes.
     #[error("too large")]
     TooLarge,
     /// Not UPER of a CPM.

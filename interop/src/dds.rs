@@ -70,7 +70,7 @@ pub struct RosSettings {
     pub input: Option<DetectorTopics>,
     /// Topic of `geometry_msgs/PoseStamped` with the poses of a detector's camera that moves.
     pub pose_topic: Option<String>,
-    /// The detector's camera.
+    /// Camera of the detector whose detections are read.
     pub camera: RosCamera,
 }
 

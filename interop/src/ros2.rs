@@ -39,7 +39,6 @@ pub(crate) trait RosSink {
     /// Error if a message was not accepted.
     type Error;
 
-    /// Processes a message.
     fn put<M: Serialize + Definition>(
         &mut self,
         topic: &str,

@@ -19,7 +19,7 @@ use crate::ros2::{
     ObjectHypothesisWithPose, PoseStamped, RosPose,
 };
 
-/// A detector's camera.
+/// Camera of a detector in ROS, and the meaning of its classes.
 #[derive(Debug, Clone)]
 pub struct RosCamera {
     /// Pose of a standing camera in the cell's frame; `None` if it is not given.

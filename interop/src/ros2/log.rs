@@ -43,7 +43,7 @@ pub enum ConversionError {
 /// Messages read and written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Conversion {
-    /// Messages written.
+    /// Number of messages that were written.
     pub written: u64,
     /// Messages of other channels, which have no equivalent in ROS.
     pub passed_over: u64,

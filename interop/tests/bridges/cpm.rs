@@ -31,7 +31,6 @@ const ORIGIN: GeographicOrigin = GeographicOrigin {
     rotation_deg: 40.0,
 };
 
-/// A running edge.
 struct Edge {
     runtime: Runtime,
     handle: Option<NodeHandle>,
