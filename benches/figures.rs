@@ -11,7 +11,6 @@ pub(crate) struct Figures {
 }
 
 impl Figures {
-    /// An empty section.
     pub(crate) fn new(section: &'static str) -> Self {
         Self {
             section,

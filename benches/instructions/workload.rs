@@ -30,27 +30,27 @@ const LANDMARKS: usize = 256;
 
 /// A thousand boxes, and what places them.
 pub struct Boxes {
-    /// The projection.
+    /// Projection of the camera that detected the boxes.
     pub projection: Projection,
     /// Pose of the camera.
     pub camera: Pose,
-    /// The boxes.
+    /// The boxes as detections, in pixels.
     pub detections: Vec<Detection>,
 }
 
 /// An algorithm after some rounds, and the reports of the next round.
 pub struct Round<A, R> {
-    /// The algorithm.
+    /// The algorithm, which is measured from this state on.
     pub algorithm: A,
-    /// The reports.
+    /// One report of each vehicle.
     pub reports: Vec<R>,
     /// Time of the round.
     pub now: Timestamp,
 }
 
-/// An encoded report.
+/// An encoded report and its sender.
 pub struct Payload {
-    /// The report.
+    /// The report in the encoding that is measured.
     pub bytes: Vec<u8>,
     /// The node whose report it is.
     pub node: NodeName,
@@ -58,9 +58,9 @@ pub struct Payload {
 
 /// A node that follows a leader, and the leader's next beat.
 pub struct Following {
-    /// The node.
+    /// Election of the follower.
     pub election: Election,
-    /// The beat.
+    /// The beat as the follower receives it.
     pub beat: ElectionInput,
     /// Time of the beat.
     pub now: Timestamp,

@@ -133,7 +133,7 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// An empty folder.
+/// Creates an empty folder, in place of an existing one.
 fn folder(work: &Path, name: &str) -> anyhow::Result<PathBuf> {
     let folder = work.join(name);
     if folder.exists() {

@@ -44,7 +44,6 @@ pub(crate) struct Vehicle {
     tick_at: Timestamp,
     aggregator: Aggregator,
     pub(crate) ledger: ReputationLedger,
-    /// The other vehicles.
     pub(crate) members: BTreeMap<NodeName, SeenMember>,
     rounds_due: u64,
     /// Time of the fuser's next timer; it may be early.

@@ -17,15 +17,15 @@ use crate::config::{loopback, name};
 
 /// A node's membership on real sockets, and its events.
 pub struct Member {
-    /// The node's name.
+    /// Name of the node.
     pub name: NodeName,
-    /// The actor.
+    /// Actor that runs the membership.
     pub actor: ActorRef<MembershipMessage>,
-    /// The gossip address.
+    /// Address of the gossip socket.
     pub address: SocketAddr,
     /// All events so far.
     pub events: Arc<Mutex<Vec<MembershipEvent>>>,
-    /// The other members.
+    /// All living nodes except this one.
     pub members: watch::Receiver<Vec<ecod_actors::transport::gossip::Member>>,
     /// Counters of its datagrams.
     pub counters: Arc<FrameCounters>,

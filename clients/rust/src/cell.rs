@@ -77,7 +77,7 @@ pub struct Frame {
     pub objects: Vec<PerceivedObject>,
     /// Pose of the camera. With it, the reporting vehicle itself is on the map.
     pub pose: Option<WirePose>,
-    /// Landmarks in view.
+    /// Names of the landmarks in view, occupied or empty; `None` if they were not determined.
     pub seen: Option<Vec<LandmarkId>>,
     /// Field of view from the pose.
     pub view: Option<FieldOfView>,

@@ -128,12 +128,10 @@ struct Scene {
     /// The present leadership, and its last sign of life.
     present: Epoch,
     life: LifeSign,
-    /// Any node.
     other: NodeName,
     seq: u64,
 }
 
-/// A false message.
 struct Statement {
     term: u64,
     epoch: Option<Epoch>,

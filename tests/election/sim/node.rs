@@ -116,7 +116,6 @@ pub(crate) enum Arrival {
     Keep,
 }
 
-/// A published map.
 #[derive(Debug, Clone)]
 pub(crate) struct Map {
     pub(crate) epoch: Epoch,
