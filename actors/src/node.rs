@@ -396,6 +396,12 @@ impl Actor for Supervisor {
         Ok(())
     }
 
+    /// Handles the end of a part: starts it again. Too many ends within [`RESTART_SPAN`], or a part
+    /// that does not start, end the node.
+    ///
+    /// # Example
+    /// The fuser panics while the node leads. Its actor is started again, the election gets
+    /// `FuserRestarted` and resigns, and the standby leads.
     async fn handle_supervisor_evt(
         &self,
         myself: ActorRef<Self::Msg>,

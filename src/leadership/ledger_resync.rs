@@ -636,6 +636,7 @@ impl LedgerResync {
             .collect()
     }
 
+    /// One unsigned share with these counts and marks, under this node's name.
     fn share_of(
         &self,
         ledger: &ReputationLedger,

@@ -229,6 +229,7 @@ fn check_age(
     }
 }
 
+/// The accepted round, with the facts that its receivers need beside the message.
 fn accepted(
     epoch: Epoch,
     round: u64,

@@ -56,6 +56,7 @@ impl PaperPace {
         }
     }
 
+    /// The same reports under other settings; objects at removed landmarks are dropped.
     pub(super) fn configured(mut self, config: &PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 1);
         for latest in self.vehicles.values_mut() {
@@ -83,6 +84,7 @@ impl PaperPace {
         (&self.landmarks, self.gate_m)
     }
 
+    /// Replaces the vehicle's report: keeps each object once for every landmark within the gate.
     pub(super) fn observe(&mut self, report: &ObjectReport, captured_at: Timestamp) {
         let latest = self.vehicles.entry(report.node.clone()).or_default();
         latest.captured_at = captured_at;
@@ -101,6 +103,7 @@ impl PaperPace {
         }
     }
 
+    /// Closes a round from the latest report of each vehicle that is not older than `max_age_s`.
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
         self.vehicles
             .retain(|_, latest| now.since(latest.captured_at) <= self.max_age);

@@ -122,6 +122,7 @@ impl DetectionHistory {
         self.slot_of(sensor).or_else(unused).or_else(expired)
     }
 
+    /// The history in a slot; a slot of another vehicle starts anew for `sensor`.
     fn occupy(&mut self, slot: usize, sensor: SensorId, at: Timestamp) -> &mut SensorHistory {
         if slot == self.histories.len() {
             self.sensors.push(sensor);

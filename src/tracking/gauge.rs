@@ -239,6 +239,7 @@ struct MotionSums {
 }
 
 impl MotionSums {
+    /// Adds the error of one observer at the place `pivot`.
     fn add(&mut self, pivot: &Vector2<f64>, error: &Vector4<f64>, weight: f64, prior: &BiasPrior) {
         let arm = quarter_turn(&(pivot - *self.about.get_or_insert(*pivot)));
         let offset = weight / (prior.offset_m * prior.offset_m);

@@ -123,6 +123,11 @@ async fn listen(
     }
 }
 
+/// Receives poses on a UDP address. Usable poses go to the actor; others, and poses beyond
+/// [`MAX_POSE_HZ`], are counted.
+///
+/// # Errors
+/// Returns the error of the socket, which ends the reception.
 async fn receive(
     address: SocketAddr,
     receiver: &ActorRef<PoseReceiverMessage>,

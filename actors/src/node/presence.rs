@@ -188,6 +188,8 @@ impl SupervisorState {
         Ok(())
     }
 
+    /// Leaves the cell: camera and pose receiver continue without this node, until the vehicle's
+    /// node in another cell takes them over.
     fn hand_over(&mut self, supervisor: &ActorCell) {
         self.builder.set_presence(Presence::Preparing);
         self.running.retain(|_, part| !part.is_of_vehicle());
@@ -198,6 +200,8 @@ impl SupervisorState {
         self.builder.counters().troubles().leave_cell();
     }
 
+    /// Takes over camera and pose receiver from the vehicle's node in the previous cell, and
+    /// reports in this cell from now on. A part that has just ended is started again.
     async fn take_over(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
         for (kind, part) in self.builder.vehicle().running() {
             part.link(supervisor.clone());

@@ -22,6 +22,7 @@ pub(super) struct AgreedLabel<'a> {
 }
 
 impl<'a> LabelScores<'a> {
+    /// Adds the vehicles' evidence about one place: for each label, and against any object.
     pub(super) fn of(beliefs: &[NamedBelief<'a>]) -> Self {
         // A separate pass: its loads, which take most of the time, do not wait for each other.
         let absence: f64 = beliefs

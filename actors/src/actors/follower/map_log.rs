@@ -67,6 +67,11 @@ impl MapLog {
         }
     }
 
+    /// Appends one line. A log that has become too large is renamed first; a file that is opened
+    /// anew loses an incomplete last line.
+    ///
+    /// # Errors
+    /// Returns the error of the operating system.
     fn write(&mut self, map: &ReceivedMap) -> io::Result<()> {
         let mut line = serde_json::to_vec(&LogLine {
             cell: &self.cell,

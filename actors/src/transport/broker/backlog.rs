@@ -105,6 +105,8 @@ impl BacklogSlot {
         self.set(|holding| holding.unfinished = bytes, now);
     }
 
+    /// Changes the bytes that the connection holds. If its party or all parties together exceed
+    /// their limit, the connections that hold bytes for longest are cut.
     fn set(&self, change: impl FnOnce(&mut Holding), now: Timestamp) {
         let mut table = self.backlog.table();
         let Some(holding) = table.connections.get_mut(&self.number) else {

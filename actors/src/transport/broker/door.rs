@@ -324,6 +324,7 @@ impl DoorState {
         }
     }
 
+    /// The next retained message that could not be sent before, with its current content.
     fn next_unsent(&self) -> Option<Publication> {
         let topic = lock(&self.unsent).pop_first()?;
         let payload = lock(&self.retained).get(&topic)?.clone();

@@ -144,6 +144,8 @@ impl BrokerFrontend {
         }
     }
 
+    /// Handles a new connection: counts and drops it above its rate, otherwise serves it in a
+    /// separate task.
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
         // With certificates even local clients can be distinguished.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();

@@ -167,6 +167,8 @@ impl Permissions {
         Ok(())
     }
 
+    /// Counts a refused message by its sender: a program's at the door, a round of a candidate that
+    /// does not lead separately, any other message as denied.
     fn record_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
         let client = &session.id.client_id;
         let topic = TopicPlace::of(&publish.topic).1;

@@ -41,6 +41,8 @@ pub(crate) async fn resolve(
 const RETRY_MIN: Duration = Duration::from_millis(500);
 const REFRESH: Duration = Duration::from_secs(30);
 
+/// Looks up every seed once. Found addresses replace earlier ones, which are kept for a seed that
+/// is not found now.
 async fn resolve_once(
     seeds: &[String],
     ipv4: bool,

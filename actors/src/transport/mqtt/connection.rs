@@ -328,6 +328,8 @@ impl Connection {
             .unwrap_or(Err(ConnectionError::Timeout(patience)))
     }
 
+    /// Sends and receives until the client library reports an event, in the form that both versions
+    /// of MQTT share.
     async fn poll(&mut self) -> Result<Packet, ConnectionError> {
         Ok(match self {
             Self::V311(events) => match events.poll().await? {

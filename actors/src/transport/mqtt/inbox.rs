@@ -123,6 +123,7 @@ impl Inbox {
         PacketOutcome::Done
     }
 
+    /// Passes a message to the current subscriber.
     fn hand_over(&self, delivery: Delivery) {
         let subscriber = Arc::clone(
             &self
@@ -133,6 +134,16 @@ impl Inbox {
         subscriber(delivery);
     }
 
+    /// Handles one packet of the cell by its topic: verifies the envelope, drops echoes of this
+    /// node and messages above their rate, decodes and checks the payload, and delivers it.
+    ///
+    /// # Errors
+    /// Returns the reason under which the packet is counted as rejected.
+    ///
+    /// # Example
+    /// A map of `edge` arrives over the link to the standby's broker. Its signature proves `edge`,
+    /// so that it is delivered as a proven round. The same map arrives over the link to `edge`'s
+    /// own broker: it is delivered again, and the follower's filter refuses it as repeated.
     fn read(
         &self,
         via: Via<'_>,
@@ -282,6 +293,11 @@ impl Inbox {
             .map_or(Ok(()), |date| check_fused_at(fused_at, date))
     }
 
+    /// Handles a vehicle's report. Parts share the rate of their vehicle, and a large report counts
+    /// as several.
+    ///
+    /// # Errors
+    /// Returns the reason why the report is unusable.
     fn read_report(
         &self,
         via: Via<'_>,
@@ -318,6 +334,12 @@ impl Inbox {
         ))
     }
 
+    /// Handles the status of a node, or its withdrawal by an empty payload. This node's own status
+    /// is not delivered: its outcome shows whether the broker declared this node offline, returned
+    /// the status, or forwarded it from another run of the same name.
+    ///
+    /// # Errors
+    /// Returns the reason why the status is unusable.
     fn read_status(
         &self,
         via: Via<'_>,

@@ -88,6 +88,8 @@ pub(crate) struct Link {
 }
 
 impl Link {
+    /// Starts a link in its own task. `report` gets its events, and the link is [`LinkState::Down`]
+    /// until the first of them.
     pub(crate) fn spawn(
         id: LinkId,
         broker: BrokerAddress,
@@ -184,6 +186,13 @@ struct LinkTask {
 }
 
 impl LinkTask {
+    /// Connects again and again until DISCONNECT was sent or the gateway has ended. After a session
+    /// that was in use the waits start from the shortest.
+    ///
+    /// # Example
+    /// The broker's process is killed after minutes: the session ends, and `Lost(Down)` is
+    /// reported. The first retry follows at once and finds the port closed: `Lost(Refused)`.
+    /// Further retries follow after 5 ms and 10 ms, then after increasing waits.
     async fn run(mut self, mut backoff: Backoff) {
         // A session that lasted longer was in use. A session that ends sooner, for example because
         // of an oversized retained packet, must not be repeated at full speed.

@@ -76,6 +76,11 @@ impl RegionInbox {
         }
     }
 
+    /// Handles one packet of the region: maps of other cells, and the status of the own cell's
+    /// leader. Own messages are counted as echoes.
+    ///
+    /// # Errors
+    /// Returns the reason under which the packet is counted as rejected.
     fn read(
         &self,
         topic: &RegionTopic,
@@ -121,6 +126,7 @@ impl RegionInbox {
         is_allowed
     }
 
+    /// Delivers a message, or counts it as dropped if the uplink is too far behind.
     fn deliver(&self, message: FromRegion, received_at: Timestamp) {
         match Arc::clone(&self.capacity).try_acquire_owned() {
             Ok(place) => {

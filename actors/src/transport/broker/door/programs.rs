@@ -269,6 +269,8 @@ impl DoorState {
         !(self.setup.follows)() && self.is_nodeless_name(principal, name)
     }
 
+    /// True if the name is free for a vehicle without a node: not this node's and not a member's,
+    /// at a broker without certificates that serves nodes.
     fn is_nodeless_name(&self, principal: &Principal, name: &NodeName) -> bool {
         let setup = &self.setup;
         let vehicle = name.vehicle();
@@ -278,6 +280,8 @@ impl DoorState {
             && !(setup.is_member)(&vehicle)
     }
 
+    /// Checks that a program may publish on a topic for other messages than reports and requests:
+    /// its own parts' status, its CPMs and, without certificates, topics of other applications.
     fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), DoorRefusal> {
         let node = &self.setup.node;
         match self.setup.topics.parse(topic) {
@@ -296,6 +300,11 @@ impl DoorState {
         }
     }
 
+    /// Handles a program's report: checks name, rate, content and use in the cell, then passes it
+    /// to the node, which publishes it.
+    ///
+    /// # Errors
+    /// Returns the refusal with the text that the program gets.
     fn on_report(
         &self,
         principal: &Principal,
