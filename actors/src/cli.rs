@@ -87,7 +87,8 @@ enum Command {
     #[command(after_long_help = "\
 Examples:
   ecod-node try                       a rendered street
-  ecod-node try --video drive.mp4     your own video")]
+  ecod-node try drive.mp4             your own video
+  ecod-node try 0 frames --height 2.5 a camera of this machine and a directory of images")]
     #[cfg(feature = "camera")]
     Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes

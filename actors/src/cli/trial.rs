@@ -1,6 +1,9 @@
 //! `ecod-node try`: a cell from the user's own pictures, without a configuration, or from the
 //! pictures of a street.
 
+mod picture_source;
+
+use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -16,11 +19,13 @@ use ecod::tracking::TracksConfig;
 use futures_util::FutureExt;
 use tokio::signal::unix::{SignalKind, signal};
 
+use self::picture_source::PictureSource;
 use super::Failure;
 use super::run::{input_ended, ip_and_port, run_to_end};
 use crate::camera::config::{CameraConfig, MountConfig, OpticsConfig};
 use crate::camera::detect::DetectorConfig;
 use crate::camera::detect::coco::CocoConfig;
+use crate::camera::detect::onnx::OnnxConfig;
 use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::CaptureConfig;
 use crate::node::config::NodeConfig;
@@ -29,21 +34,43 @@ use crate::observe::dashboard::DEFAULT_ADDRESS;
 use crate::platform::installed;
 use crate::telemetry::counters::Event;
 
-/// Flags of `try`.
+/// Arguments of `try`.
 #[derive(Debug, Args)]
 pub(super) struct TryArguments {
-    /// Video files, played repeatedly
-    #[arg(long, value_name = "FILE", num_args = 1..)]
+    /// Video files, images, directories of images, patterns such as frames/%04d.png, cameras of
+    /// this machine (0 or /dev/video0) and addresses of network cameras (rtsp://, http://). Files
+    /// are shown repeatedly
+    #[arg(value_name = "SOURCE", group = "sources")]
+    source: Vec<PictureSource>,
+    /// Video files
+    #[arg(long, value_name = "FILE", num_args = 1.., group = "sources", hide = true)]
     video: Vec<PathBuf>,
-    /// Directories of images, shown repeatedly in the order of their names
-    #[arg(long, value_name = "DIR", num_args = 1..)]
+    /// Directories of images
+    #[arg(long, value_name = "DIR", num_args = 1.., group = "sources", hide = true)]
     images: Vec<PathBuf>,
-    /// Numbers of cameras of this machine, 0 for /dev/video0
-    #[arg(long, value_name = "N", num_args = 1..)]
+    /// Numbers of cameras of this machine
+    #[arg(long, value_name = "N", num_args = 1.., group = "sources", hide = true)]
     camera: Vec<u32>,
-    /// Addresses of network cameras, such as rtsp://192.168.1.20/stream1
-    #[arg(long, value_name = "URL", num_args = 1..)]
+    /// Addresses of network cameras
+    #[arg(long, value_name = "URL", num_args = 1.., group = "sources", hide = true)]
     url: Vec<String>,
+    /// ONNX file of your own detector, in place of the COCO detector
+    #[arg(long, value_name = "FILE", requires = "sources")]
+    model: Option<PathBuf>,
+    /// Horizontal field of view of the cameras in degrees. Default 62.2
+    #[arg(long, value_name = "DEGREES", requires = "sources")]
+    fov: Option<f64>,
+    /// Height of the cameras above the ground in metres. Default 1.5
+    #[arg(long, value_name = "METRES", requires = "sources")]
+    height: Option<f64>,
+    /// Angle of the cameras below the horizon in degrees. Default 0
+    #[arg(
+        long,
+        value_name = "DEGREES",
+        requires = "sources",
+        allow_negative_numbers = true
+    )]
+    pitch: Option<f64>,
     /// Write the configuration that is used; the files of further vehicles are numbered, as in
     /// node-2.toml
     #[arg(short, long, alias = "save", value_name = "FILE")]
@@ -81,64 +108,84 @@ pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
 }
 
 impl TryArguments {
-    /// The frame sources with the names of their vehicles.
-    fn sources(&self) -> Vec<(String, SourceConfig)> {
-        let numbered = |kind: &str, index: usize| format!("{kind}-{}", index + 1);
-        // A saved configuration should work in every directory.
-        let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
-        let videos = self.video.iter().enumerate().map(|(index, path)| {
-            (
-                numbered("video", index),
-                SourceConfig::Video {
-                    path: absolute(path),
-                    looping: true,
-                },
-            )
-        });
-        let images = self.images.iter().enumerate().map(|(index, path)| {
-            (
-                numbered("images", index),
-                SourceConfig::Images {
-                    path: absolute(path),
-                    fps: 5.0,
-                    looping: true,
-                },
-            )
-        });
-        let cameras = self.camera.iter().map(|number| {
-            let device = PathBuf::from(format!("/dev/video{number}"));
-            (
-                format!("camera-{number}"),
-                SourceConfig::V4l2 {
-                    device,
-                    width: None,
-                    height: None,
-                    fps: None,
-                },
-            )
-        });
-        let urls = self.url.iter().enumerate().map(|(index, url)| {
-            (
-                numbered("url", index),
-                SourceConfig::Url { url: url.clone() },
-            )
-        });
-        videos.chain(images).chain(cameras).chain(urls).collect()
+    /// All sources: those by position, then those by flags of the kind.
+    fn sources(&self) -> Vec<PictureSource> {
+        let videos = self.video.iter().cloned().map(PictureSource::Video);
+        let images = self.images.iter().cloned().map(PictureSource::Images);
+        let devices = self
+            .camera
+            .iter()
+            .map(|number| PictureSource::device(*number));
+        let urls = self.url.iter().cloned().map(PictureSource::Url);
+        let flagged = videos.chain(images).chain(devices).chain(urls);
+        self.source.iter().cloned().chain(flagged).collect()
+    }
+
+    /// The sources with the names of their vehicles, such as `video-2` for the second video.
+    fn named_sources(&self) -> Vec<(String, SourceConfig)> {
+        let mut counts = BTreeMap::<&str, usize>::new();
+        let mut named = Vec::new();
+        for source in self.sources() {
+            let count = counts.entry(source.kind()).or_default();
+            *count += 1;
+            named.push((format!("{}-{count}", source.kind()), source.into_config()));
+        }
+        named
+    }
+
+    /// A camera with default guesses for all unstated values. The covariance of its objects includes
+    /// the errors of the guesses.
+    fn camera(&self, source: SourceConfig) -> CameraConfig {
+        let mut optics = OpticsConfig::default();
+        if let Some(fov_deg) = self.fov {
+            optics.horizontal_fov_deg = fov_deg;
+        }
+        let mut projection = ProjectionConfig {
+            pixel_sigma_px: 4.0,
+            ..ProjectionConfig::default()
+        };
+        if self.pitch.is_none() {
+            projection.tilt_sigma_rad = 0.07;
+        }
+        if self.height.is_none() {
+            projection.height_sigma_m = 0.4;
+        }
+        let detector = match &self.model {
+            Some(model) => DetectorConfig::Onnx(OnnxConfig::of(
+                std::path::absolute(model).unwrap_or_else(|_| model.clone()),
+            )),
+            None => DetectorConfig::Coco(CocoConfig::default()),
+        };
+        CameraConfig {
+            name: None,
+            source,
+            capture: CaptureConfig::default(),
+            optics,
+            mount: MountConfig {
+                height_m: Some(self.height.unwrap_or(CAMERA_HEIGHT_M)),
+                pitch_deg: self.pitch.unwrap_or_default(),
+                ..MountConfig::default()
+            },
+            detector,
+            projection,
+            view: ViewConfig::default(),
+            votes: false,
+        }
     }
 
     /// The configurations of the vehicles. The other vehicles get the first vehicle's address once
     /// it runs.
     fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
-        let sources = self.sources();
         let mut configs = Vec::new();
-        for (index, (name, source)) in sources.into_iter().enumerate() {
+        for (index, (name, source)) in self.named_sources().into_iter().enumerate() {
             if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = source {
                 source
                     .open(PROGRESS_PERIOD)
                     .map(drop)
                     .map_err(Failure::usage)?;
             }
-            let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
+            let name = NodeName::new(name).map_err(Failure::usage)?;
+            let mut config = vehicle(name, self.camera(source));
             config.pose.y_m -= SPACING_M * index as f64;
             configs.push(config);
         }
@@ -190,8 +237,8 @@ fn street() -> anyhow::Result<Vec<NodeConfig>> {
     )?;
     let missing = || {
         format!(
-            "no street in {}: run this in ecod's sources, or install the package ecod-node; or give --video FILE, --images DIR, \
-             --camera 0 or --url rtsp://...",
+            "no street in {}: run this in ecod's sources, or install the package ecod-node; or give a video, a directory of \
+             images, a camera such as 0, or an address such as rtsp://...",
             directory.display()
         )
     };
@@ -227,28 +274,8 @@ fn isolate(config: &mut NodeConfig) {
     config.membership.multicast.enabled = false;
 }
 
-/// A vehicle that stands at the origin, with default guesses for all unstated values. The
-/// covariance of its objects includes the errors of the guesses.
-fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
-    let camera = CameraConfig {
-        name: None,
-        source,
-        capture: CaptureConfig::default(),
-        optics: OpticsConfig::default(),
-        mount: MountConfig {
-            height_m: Some(CAMERA_HEIGHT_M),
-            ..MountConfig::default()
-        },
-        detector: DetectorConfig::Coco(CocoConfig::default()),
-        projection: ProjectionConfig {
-            pixel_sigma_px: 4.0,
-            tilt_sigma_rad: 0.07,
-            height_sigma_m: 0.4,
-            ..ProjectionConfig::default()
-        },
-        view: ViewConfig::default(),
-        votes: false,
-    };
+/// A vehicle that stands at the origin.
+fn vehicle(name: NodeName, camera: CameraConfig) -> NodeConfig {
     // A hand-held camera is not a car, and objects may be close to it.
     let tracks = TracksConfig {
         vehicle_radius_m: 0.1,

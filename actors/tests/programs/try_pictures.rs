@@ -134,8 +134,8 @@ fn two_cameras_make_one_map() {
     let mut command = ecod_node();
     command
         .arg("try")
-        .arg("--images")
         .args(&albums)
+        .args(["--height", "1.4"])
         .args(["--dashboard", "127.0.0.1:0"])
         .arg("--save")
         .arg(&saved);
@@ -197,7 +197,7 @@ fn two_cameras_make_one_map() {
             .unwrap();
         let text = String::from_utf8(printed.stdout).unwrap();
         assert!(
-            printed.status.success() && text.contains(images) && text.contains("height_m = 1.5"),
+            printed.status.success() && text.contains(images) && text.contains("height_m = 1.4"),
             "{text}"
         );
     }
@@ -265,31 +265,28 @@ fn unusable_picture_names_remedy() {
             vec![
                 "examples/street",
                 "package",
-                "--video FILE",
-                "--images DIR",
-                "--camera 0",
+                "a video",
+                "a directory of images",
+                "a camera such as 0",
             ],
         ),
         (vec!["try", "--video", "no-such.mp4"], vec!["no-such.mp4"]),
-        (
-            vec!["try", "--images", nothing],
-            vec![nothing, "no images found"],
-        ),
+        (vec!["try", nothing], vec![nothing, "no images found"]),
         (vec!["try", "--url", "192.168.1.20"], vec!["rtsp://"]),
         (
             vec!["try", "--video", nothing],
-            vec![nothing, "a directory", "--images"],
+            vec![nothing, "a directory", "`images`"],
         ),
         (
-            vec!["try", "--images", &shown, "--save", &there],
+            vec!["try", &shown, "--save", &there],
             vec![&there, "another name"],
         ),
         (
-            vec!["try", "--images", &shown, "--save", "none/node.toml"],
+            vec!["try", &shown, "--save", "none/node.toml"],
             vec!["none/node.toml", "make the directory"],
         ),
         (
-            vec!["try", "--images", &shown, "--dashboard", &taken],
+            vec!["try", &shown, "--dashboard", &taken],
             vec![&taken, "another address"],
         ),
     ] {

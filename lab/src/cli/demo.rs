@@ -113,7 +113,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         },
     )?;
     Ok(print(&format!(
-        "\npictures, results, configurations and logs: {}\nnext: a map of your own video, with {} try --video FILE\n",
+        "\npictures, results, configurations and logs: {}\nnext: a map of your own video, with {} try FILE\n",
         arguments.out.display(),
         show.program.display()
     ))?)

@@ -196,7 +196,7 @@ fn street_cell_outperforms_cameras_after_failover() {
         "{told}"
     );
     assert!(
-        told.contains("precision:") && told.contains("next: ") && told.contains(" try --video"),
+        told.contains("precision:") && told.contains("next: ") && told.contains(" try FILE"),
         "words are explained and the next command is shown: {told}"
     );
 }

@@ -23,7 +23,7 @@ pub(super) struct ImageSequence {
 }
 
 impl ImageSequence {
-    /// Lists the images of a directory or a numbered pattern.
+    /// Lists the images of a directory or a numbered pattern; `path` may also be one image.
     pub(super) fn open(path: &Path, fps: f64, looping: bool) -> Result<Self, FrameError> {
         let origin = path.display().to_string();
         let failed = |reason: String| FrameError::Open {
@@ -34,6 +34,8 @@ impl ImageSequence {
         let files = if name.contains('%') && !path.is_dir() {
             numbered(path, &name)
                 .ok_or_else(|| failed("need one %d or %0Nd in the pattern".into()))?
+        } else if path.is_file() {
+            vec![path.to_owned()]
         } else {
             in_directory(path).map_err(|e| failed(e.to_string()))?
         };
@@ -79,16 +81,15 @@ impl FrameSource for ImageSequence {
 pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(directory)?.map(|entry| Ok(entry?.path()));
     let mut files = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
-    let is_image = |path: &PathBuf| {
-        let extension = path
-            .extension()
-            .and_then(|e| e.to_str())
-            .map(str::to_ascii_lowercase);
-        extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
-    };
-    files.retain(is_image);
+    files.retain(|path| is_image(path));
     files.sort();
     Ok(files)
+}
+
+/// True if the name of a file is one of an image.
+pub(crate) fn is_image(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str());
+    extension.is_some_and(|e| EXTENSIONS.contains(&e.to_ascii_lowercase().as_str()))
 }
 
 /// Existing files of the pattern `name`, the last part of `path`, counting up to the first gap.

@@ -435,7 +435,7 @@ fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
     let file = File::open(path).map_err(failed)?;
     if file.metadata().map_err(failed)?.is_dir() {
         return Err(failed(std::io::Error::other(
-            "it is a directory: for images use kind `images`, or `--images`",
+            "it is a directory: for images use kind `images`",
         )));
     }
     Ok(())
