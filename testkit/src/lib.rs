@@ -9,6 +9,7 @@ mod cell;
 mod config;
 mod help;
 mod member;
+mod people;
 mod program;
 mod wait;
 
@@ -17,5 +18,6 @@ pub use cell::Cell;
 pub use config::{free_gossip_address, greet, loopback, name, node_config};
 pub use help::help_of;
 pub use member::{Member, member_config};
+pub use people::walking_people;
 pub use program::{command, output_of};
 pub use wait::{PATIENCE, until, until_by};

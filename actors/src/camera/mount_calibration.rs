@@ -1,5 +1,7 @@
-//! The mount of a configured camera: found from points that a person measured, and written for the
-//! configuration.
+//! The mount of a configured camera: found from points that a person measured or from people who
+//! walk, and written for the configuration.
+
+pub(crate) mod people;
 
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;

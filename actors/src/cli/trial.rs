@@ -1,9 +1,11 @@
 //! `ecod-node try`: a cell from the user's own pictures, without a configuration, or from the
 //! pictures of a street.
 
+mod camera_watch;
 mod picture_source;
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -13,12 +15,13 @@ use anyhow::{Context, ensure};
 use clap::Args;
 use ecod::aggregator::FusionConfig;
 use ecod::model::names::{Label, NodeName};
-use ecod::perception::projection::ProjectionConfig;
+use ecod::perception::projection::{MountEstimate, ProjectionConfig};
 use ecod::perception::view::ViewConfig;
 use ecod::tracking::TracksConfig;
 use futures_util::FutureExt;
 use tokio::signal::unix::{SignalKind, signal};
 
+use self::camera_watch::CameraWatch;
 use self::picture_source::PictureSource;
 use super::Failure;
 use super::run::{input_ended, ip_and_port, run_to_end};
@@ -35,7 +38,7 @@ use crate::platform::installed;
 use crate::telemetry::counters::Event;
 
 /// Arguments of `try`.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub(super) struct TryArguments {
     /// Video files, images, directories of images, patterns such as frames/%04d.png, cameras of
     /// this machine (0 or /dev/video0) and addresses of network cameras (rtsp://, http://). Files
@@ -60,10 +63,11 @@ pub(super) struct TryArguments {
     /// Horizontal field of view of the cameras in degrees. Default 62.2
     #[arg(long, value_name = "DEGREES", requires = "sources")]
     fov: Option<f64>,
-    /// Height of the cameras above the ground in metres. Default 1.5
+    /// Height of the cameras above the ground in metres. Without it and --pitch: 1.5, until people who
+    /// walk give both
     #[arg(long, value_name = "METRES", requires = "sources")]
     height: Option<f64>,
-    /// Angle of the cameras below the horizon in degrees. Default 0
+    /// Angle of the cameras below the horizon in degrees. Default 0, or from people who walk
     #[arg(
         long,
         value_name = "DEGREES",
@@ -100,14 +104,20 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 
 pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
-    run_to_end(serve(
-        configs,
-        arguments.output.as_deref(),
-        arguments.stop_at_eof,
-    ))
+    let trial = Trial {
+        output: arguments.output.clone(),
+        finds_cameras: arguments.finds_cameras(),
+        vehicles: Vec::new(),
+    };
+    run_to_end(trial.serve(configs, arguments.stop_at_eof))
 }
 
 impl TryArguments {
+    /// True if height and tilt of the cameras are guesses, which people who walk can replace.
+    fn finds_cameras(&self) -> bool {
+        !self.sources().is_empty() && self.height.is_none() && self.pitch.is_none()
+    }
+
     /// All sources: those by position, then those by flags of the kind.
     fn sources(&self) -> Vec<PictureSource> {
         let videos = self.video.iter().cloned().map(PictureSource::Video);
@@ -293,25 +303,212 @@ fn vehicle(name: NodeName, camera: CameraConfig) -> NodeConfig {
     }
 }
 
-/// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
-async fn serve(
-    configs: Vec<NodeConfig>,
-    save: Option<&Path>,
-    stop_at_eof: bool,
-) -> anyhow::Result<()> {
-    let mut nodes = Vec::new();
-    let outcome = tokio::select! {
-        outcome = start_and_watch(configs, save, &mut nodes) => outcome,
-        stopped = stop_signal() => stopped,
-        () = input_ended(), if stop_at_eof => Ok(()),
-    };
-    if std::io::stderr().is_terminal() {
-        eprintln!();
+/// The running vehicles of `try`.
+struct Trial {
+    /// File for the first vehicle's configuration.
+    output: Option<PathBuf>,
+    /// Whether people who walk give height and tilt of the cameras.
+    finds_cameras: bool,
+    vehicles: Vec<Vehicle>,
+}
+
+/// A vehicle with its node.
+struct Vehicle {
+    /// The configuration, as `--output` writes it.
+    config: NodeConfig,
+    /// Address of its page.
+    page: SocketAddr,
+    /// `None` if height and tilt of the camera are stated or found.
+    watch: Option<CameraWatch>,
+    node: NodeHandle,
+}
+
+impl Vehicle {
+    fn name(&self) -> &str {
+        self.config
+            .name
+            .as_ref()
+            .map_or("a vehicle", NodeName::as_str)
     }
-    for node in nodes.into_iter().rev() {
+
+    /// Height and tilt of the camera, if people have just determined them.
+    async fn find_camera(&mut self) -> anyhow::Result<Option<MountEstimate>> {
+        let Some(mut watch) = self.watch.take() else {
+            return Ok(None);
+        };
+        let fit = move || {
+            let found = watch.find();
+            (watch, found)
+        };
+        let (watch, found) = tokio::task::spawn_blocking(fit).await?;
+        self.watch = Some(watch).filter(|_| found.is_none());
+        Ok(found)
+    }
+}
+
+impl Trial {
+    /// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
+    async fn serve(mut self, configs: Vec<NodeConfig>, stop_at_eof: bool) -> anyhow::Result<()> {
+        let outcome = tokio::select! {
+            outcome = self.start_and_watch(configs) => outcome,
+            stopped = stop_signal() => stopped,
+            () = input_ended(), if stop_at_eof => Ok(()),
+        };
+        if std::io::stderr().is_terminal() {
+            eprintln!();
+        }
+        for vehicle in self.vehicles.into_iter().rev() {
+            vehicle.node.stop().await;
+        }
+        outcome
+    }
+
+    async fn start_and_watch(&mut self, configs: Vec<NodeConfig>) -> anyhow::Result<()> {
+        for (index, mut config) in configs.into_iter().enumerate() {
+            let first = self.vehicles.first();
+            let seed = first.and_then(|vehicle| vehicle.node.gossip_address());
+            config.membership.seeds = seed.iter().map(ToString::to_string).collect();
+            let vehicle = self.start(config).await?;
+            let page = vehicle.page;
+            if index == 0 {
+                eprintln!("page: http://{page}/   (Ctrl-C ends)");
+            } else {
+                eprintln!("page of {}: http://{page}/", vehicle.name());
+            }
+            self.vehicles.push(vehicle);
+            self.save(index, |path| File::create_new(path))?;
+        }
+        self.watch().await
+    }
+
+    /// Starts a vehicle. The first one's configuration then states the address that its node has
+    /// chosen, at which the others find it.
+    async fn start(&self, mut config: NodeConfig) -> anyhow::Result<Vehicle> {
+        let mut running = config.clone();
+        let mut watch = None;
+        if self.finds_cameras
+            && let Some(camera) = running.camera.take()
+        {
+            let (people, camera) = CameraWatch::new(camera)?;
+            watch = Some(people);
+            running.camera = Some(camera);
+        }
+        let node = node::start(running).await?;
+        let mut page = node.dashboard_address();
+        let page = page.wait_for(Option::is_some).await;
+        let page = page.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
+        if self.vehicles.is_empty() {
+            config.membership.bind = node.gossip_address();
+        }
+        Ok(Vehicle {
+            config,
+            page,
+            watch,
+            node,
+        })
+    }
+
+    /// Writes the configuration of a vehicle, if requested.
+    fn save(
+        &self,
+        index: usize,
+        open: impl FnOnce(&Path) -> std::io::Result<File>,
+    ) -> anyhow::Result<()> {
+        let Some(path) = &self.output else {
+            return Ok(());
+        };
+        let path = numbered(path, index);
+        let text = self.vehicles[index]
+            .config
+            .to_toml_changed()
+            .context("the configuration cannot be written as TOML")?;
+        let written = open(&path).and_then(|mut file| file.write_all(text.as_bytes()));
+        written.with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// Reports progress, and starts a vehicle anew when its camera is found, until a node gives up.
+    async fn watch(&mut self) -> anyhow::Result<()> {
+        let mut ticks = tokio::time::interval(PROGRESS_PERIOD);
+        let mut frames = 0;
+        let mut shown = String::new();
+        loop {
+            ticks.tick().await;
+            for index in 0..self.vehicles.len() {
+                let vehicle = &mut self.vehicles[index];
+                vehicle.node.failed().now_or_never().unwrap_or(Ok(()))?;
+                if let Some(estimate) = vehicle.find_camera().await? {
+                    self.use_camera(index, &estimate).await?;
+                }
+            }
+            let detected = self.events(Event::FrameDetected);
+            let rate = detected.saturating_sub(std::mem::replace(&mut frames, detected)) as f64
+                / PROGRESS_PERIOD.as_secs_f64();
+            let map = self.vehicles.first().and_then(|vehicle| {
+                let map = vehicle.node.newest_map();
+                let objects = map.borrow().as_ref().map(|map| map.map.objects.len());
+                objects
+            });
+            let objects = map.map_or_else(
+                || "no map yet".to_owned(),
+                |objects| format!("{objects} objects on the map"),
+            );
+            let unplaced = self.events(Event::DetectionUnplaced);
+            let line =
+                format!("{rate:.0} frames/s, {objects}, {unplaced} detections without a place");
+            let mut output = std::io::stderr().lock();
+            // Failing to show progress does not end the trial.
+            let _ = if output.is_terminal() {
+                write!(output, "\r\x1b[K{line}").and_then(|()| output.flush())
+            } else if line != shown {
+                writeln!(output, "{line}")
+            } else {
+                Ok(())
+            };
+            shown = line;
+        }
+    }
+
+    /// Count of an event of all vehicles since they were last started.
+    fn events(&self, event: Event) -> u64 {
+        let counts = self
+            .vehicles
+            .iter()
+            .map(|vehicle| vehicle.node.counters().events(event));
+        counts.sum()
+    }
+
+    /// Starts a vehicle anew with height and tilt of its camera.
+    async fn use_camera(&mut self, index: usize, estimate: &MountEstimate) -> anyhow::Result<()> {
+        let Vehicle {
+            mut config,
+            page,
+            node,
+            ..
+        } = self.vehicles.remove(index);
         node.stop().await;
+        if let Some(camera) = &mut config.camera {
+            camera_watch::apply(estimate, camera);
+        }
+        let mut running = config.clone();
+        running.dashboard.listen = Some(page);
+        let node = node::start(running).await?;
+        let vehicle = Vehicle {
+            config,
+            page,
+            watch: None,
+            node,
+        };
+        let pitch_deg = estimate.mount.pitch_rad.to_degrees();
+        eprintln!(
+            "camera of {} found from people who walk: {:.1} m high, {:.0}° {}",
+            vehicle.name(),
+            estimate.mount.height_m.unwrap_or_default(),
+            pitch_deg.abs(),
+            if pitch_deg < 0.0 { "up" } else { "down" }
+        );
+        self.vehicles.insert(index, vehicle);
+        self.save(index, |path| File::create(path))
     }
-    outcome
 }
 
 async fn stop_signal() -> anyhow::Result<()> {
@@ -322,48 +519,6 @@ async fn stop_signal() -> anyhow::Result<()> {
         _ = terminate.recv() => {}
     }
     Ok(())
-}
-
-async fn start_and_watch(
-    configs: Vec<NodeConfig>,
-    save: Option<&Path>,
-    nodes: &mut Vec<NodeHandle>,
-) -> anyhow::Result<()> {
-    for (index, mut config) in configs.into_iter().enumerate() {
-        config.membership.seeds = nodes
-            .first()
-            .and_then(NodeHandle::gossip_address)
-            .iter()
-            .map(ToString::to_string)
-            .collect();
-        let node = node::start(config.clone()).await?;
-        let mut address = node.dashboard_address();
-        let page = address
-            .wait_for(Option::is_some)
-            .await
-            .context("the page ended")?
-            .unwrap_or(DEFAULT_ADDRESS);
-        if index == 0 {
-            config.membership.bind = node.gossip_address();
-            eprintln!("page: http://{page}/   (Ctrl-C ends)");
-        } else {
-            eprintln!(
-                "page of {}: http://{page}/",
-                config.name.as_ref().map_or("another", NodeName::as_str)
-            );
-        }
-        nodes.push(node);
-        if let Some(path) = save {
-            let path = numbered(path, index);
-            let text = config
-                .to_toml_changed()
-                .context("the configuration cannot be written as TOML")?;
-            let written = std::fs::File::create_new(&path)
-                .and_then(|mut file| file.write_all(text.as_bytes()));
-            written.with_context(|| format!("cannot write {}", path.display()))?;
-        }
-    }
-    watch(nodes).await
 }
 
 /// `node.toml`, `node-2.toml`, `node-3.toml` …
@@ -379,48 +534,70 @@ fn numbered(path: &Path, index: usize) -> PathBuf {
     path.with_file_name(format!("{stem}-{}{extension}", index + 1))
 }
 
-/// Reports progress until a node gives up.
-async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
-    let sum = |nodes: &[NodeHandle], event| {
-        nodes
-            .iter()
-            .map(|node| node.counters().events(event))
-            .sum::<u64>()
-    };
-    let mut ticks = tokio::time::interval(PROGRESS_PERIOD);
-    let mut frames = 0;
-    let mut shown = String::new();
-    loop {
-        ticks.tick().await;
-        for node in nodes.iter_mut() {
-            node.failed().now_or_never().unwrap_or(Ok(()))?;
-        }
-        let detected = sum(nodes, Event::FrameDetected);
-        let rate = (detected - std::mem::replace(&mut frames, detected)) as f64
-            / PROGRESS_PERIOD.as_secs_f64();
-        let map = nodes.first().and_then(|node| {
-            node.newest_map()
-                .borrow()
-                .as_ref()
-                .map(|map| map.map.objects.len())
-        });
-        let objects = map.map_or_else(
-            || "no map yet".to_owned(),
-            |objects| format!("{objects} objects on the map"),
-        );
-        let line = format!(
-            "{rate:.0} frames/s, {objects}, {} detections without a place",
-            sum(nodes, Event::DetectionUnplaced)
-        );
-        let mut output = std::io::stderr().lock();
-        // Failing to show progress does not end the trial.
-        let _ = if output.is_terminal() {
-            write!(output, "\r\x1b[K{line}").and_then(|()| output.flush())
-        } else if line != shown {
-            writeln!(output, "{line}")
-        } else {
-            Ok(())
+#[cfg(test)]
+mod tests {
+    use ecod::perception::camera::{Intrinsics, Mount};
+    use ecod_testkit::{until, walking_people};
+    use opencv::core::{CV_8UC1, Mat, Scalar};
+
+    use super::*;
+    use crate::camera::detect::recorded::RecordedConfig;
+    use crate::camera::image_codec::encode_jpeg;
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn walking_people_replace_guessed_mount() {
+        let directory = tempfile::tempdir().unwrap();
+        let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
+        std::fs::write(
+            directory.path().join("0.jpg"),
+            encode_jpeg(&blank, 95).unwrap(),
+        )
+        .unwrap();
+        let real = Mount {
+            height_m: Some(3.5),
+            pitch_rad: 18f64.to_radians(),
+            ..Mount::default()
         };
-        shown = line;
+        let optics = Intrinsics::with_square_pixels(1280, 720, 62.2f64.to_radians());
+        let boxes = directory.path().join("boxes.jsonl");
+        let lines = (0..300).map(|frame| {
+            let people = walking_people(f64::from(frame) * 0.3, &real, optics);
+            serde_json::to_string(&people).unwrap() + "\n"
+        });
+        std::fs::write(&boxes, lines.collect::<String>()).unwrap();
+        let source = SourceConfig::Images {
+            path: directory.path().to_owned(),
+            fps: 100.0,
+            looping: true,
+        };
+        let arguments = TryArguments::default();
+        let mut config = vehicle(NodeName::from_static("images-1"), arguments.camera(source));
+        isolate(&mut config);
+        config.dashboard.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+        config.camera.as_mut().unwrap().detector = DetectorConfig::Recorded(RecordedConfig {
+            path: boxes,
+            looping: true,
+        });
+        let saved = directory.path().join("node.toml");
+        let trial = Trial {
+            output: Some(saved.clone()),
+            finds_cameras: true,
+            vehicles: Vec::new(),
+        };
+        let found = || -> Option<[f64; 2]> {
+            let text = std::fs::read_to_string(&saved).ok()?;
+            let config: toml::Table = text.parse().ok()?;
+            let mount = config["camera"]["mount"].as_table()?;
+            let pitch_deg = mount.get("pitch_deg")?.as_float()?;
+            Some([mount.get("height_m")?.as_float()?, pitch_deg])
+        };
+        let is_found = || found().is_some_and(|[height_m, _]| height_m != CAMERA_HEIGHT_M);
+        tokio::select! {
+            outcome = trial.serve(vec![config], false) => panic!("ended: {outcome:?}"),
+            _ = until("the mount is found", is_found) => {}
+        }
+        let [height_m, pitch_deg] = found().unwrap();
+        assert!((height_m / 3.5 - 1.0).abs() < 0.08, "{height_m}");
+        assert!((pitch_deg - 18.0).abs() < 1.0, "{pitch_deg}");
     }
 }

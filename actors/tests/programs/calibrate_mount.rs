@@ -4,12 +4,11 @@ use std::f64::consts::TAU;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::view::PosedCamera;
 use ecod_actors::camera::image_codec::encode_jpeg;
-use nalgebra::Point2;
+use ecod_testkit::walking_people;
 use opencv::core::{CV_8UC1, Mat, Scalar};
 
 const NODE: &str = "# A camera on a mast.\nname = \"mast\"\n[pose]\nx_m = 10\ny_m = -5\nheading_deg = 90\n\
@@ -201,54 +200,6 @@ fn points_update_mount_in_file() {
     );
 }
 
-/// Boxes of a frame: people of several heights on their ways, at a time in seconds.
-fn people(at_s: f64) -> Vec<Detection> {
-    let heights_m = [1.58, 1.83, 1.66, 1.74, 1.55, 1.79, 1.62, 1.7];
-    let level = Pose::new(0.0, 0.0, 0.0);
-    let mut boxes = Vec::new();
-    for (person, height_m) in (0u32..).zip(heights_m) {
-        let phase = f64::from(person) * 1.9;
-        let reach_m = 4.0 + f64::from(person % 3);
-        let middle = Point2::new(
-            11.0 + reach_m * (at_s * 0.25 + phase).sin(),
-            3.0 * (at_s * 0.17 + 2.0 * phase).cos(),
-        );
-        let row = |up_m: f64, ahead_m: f64, left_m: f64| {
-            let mount = Mount {
-                height_m: real().height_m.map(|height| height - up_m),
-                ..real()
-            };
-            PosedCamera::new(level, &mount, camera())
-                .pixel(&Point2::new(middle.x + ahead_m, middle.y + left_m))
-        };
-        let seen: Option<Vec<_>> = [
-            row(0.0, -0.25, 0.1),
-            row(0.0, 0.2, -0.1),
-            row(height_m, 0.0, 0.0),
-            row(1.4, 0.0, 0.22),
-            row(1.4, 0.0, -0.22),
-        ]
-        .into_iter()
-        .collect();
-        let Some(bounding_box) = seen.map(|points| BoundingBox::around(&points)) else {
-            continue;
-        };
-        if bounding_box.x_min > 0.0
-            && bounding_box.x_max < 1280.0
-            && bounding_box.y_min > 0.0
-            && bounding_box.y_max < 720.0
-        {
-            boxes.push(Detection {
-                label: "person".into(),
-                confidence: 0.9,
-                bounding_box,
-                corners: None,
-            });
-        }
-    }
-    boxes
-}
-
 #[test]
 fn people_give_height_and_tilt() {
     let directory = workplace();
@@ -264,7 +215,10 @@ fn people_give_height_and_tilt() {
             )
             .unwrap();
         }
-        lines += &(serde_json::to_string(&people(f64::from(number) * 0.3)).unwrap() + "\n");
+        lines +=
+            &(serde_json::to_string(&walking_people(f64::from(number) * 0.3, &real(), camera()))
+                .unwrap()
+                + "\n");
     }
     std::fs::write(directory.path().join("boxes.jsonl"), lines).unwrap();
     let output = calibrate(directory.path(), &["people"]);

@@ -1,18 +1,17 @@
 //! `ecod-node calibrate mount`: height and tilt of a camera, and its place if the points determine
 //! it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::{Args, Subcommand};
-use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::model::names::Label;
 use ecod::model::origin::StatedPose;
-use ecod::perception::projection::{Cut, MountEstimate, ObjectSize, Projection, fit_mount};
+use ecod::perception::projection::{MountEstimate, ObjectSize};
 use tokio::time::{Instant, timeout_at};
 use toml_edit::{DocumentMut, Item, TableLike};
 
@@ -21,11 +20,11 @@ use crate::camera::calibrate::board::{GroundBoard, fit_board};
 use crate::camera::calibrate::mount::PointFit;
 use crate::camera::calibrate::{Chessboard, read_gray};
 use crate::camera::config::{CameraConfig, MountConfig};
-use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::Capture;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+use crate::camera::mount_calibration::people::PeopleWatch;
 use crate::camera::mount_calibration::{MeasuredPoint, fit_mount_to_points, mount_table};
 use crate::node;
 use crate::node::config::NodeConfig;
@@ -399,44 +398,36 @@ impl PeopleArguments {
             }
             None => size,
         };
-        let watched = self.watch(&camera, lens)?;
-        let boxes: usize = watched.people.iter().map(Vec::len).sum();
+        let watched = self.watch(camera, lens, size)?;
         eprintln!(
-            "{boxes} whole boxes of {:?} in {} frames",
+            "{} whole boxes of {:?} in {} frames",
+            watched.boxes(),
             self.label,
-            watched.people.len()
+            watched.frames()
         );
-        let sigma_px = camera.projection.pixel_sigma_px;
-        let intrinsics = watched.lens.intrinsics;
-        let estimate = fit_mount(
-            &watched.people,
-            &size,
-            sigma_px,
-            &intrinsics,
-            &camera.mount.into(),
-        );
-        let others = watched
-            .others
-            .iter()
-            .map(Label::as_str)
-            .collect::<Vec<_>>()
-            .join(", ");
+        let others: Vec<&str> = watched.others().iter().map(Label::as_str).collect();
         let seen = if others.is_empty() {
             String::new()
         } else {
-            format!(" (also seen: {others})")
+            format!(" (also seen: {})", others.join(", "))
         };
-        let estimate =
-            estimate.with_context(|| format!("{:?} gives no mount{seen}", self.label))?;
-        self.node.tell(&estimate, &watched.lens)
+        let estimate = watched
+            .fit()
+            .with_context(|| format!("{:?} gives no mount{seen}", self.label))?;
+        self.node.tell(&estimate, watched.lens())
     }
 
     /// Detections of the node's detector until the time is up, or the source ends.
-    fn watch(&self, camera: &CameraConfig, lens: Lens) -> Result<Watched, Failure> {
+    fn watch(
+        &self,
+        camera: CameraConfig,
+        lens: Lens,
+        size: ObjectSize,
+    ) -> Result<PeopleWatch, Failure> {
         let mut detector = camera.detector.build().map_err(Failure::usage)?;
         let source = camera.source.clone();
         let capture = camera.capture.clone();
-        let timeout = node::camera::open_timeout(camera);
+        let timeout = node::camera::open_timeout(&camera);
         source.open(timeout).map(drop).map_err(Failure::usage)?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_time()
@@ -445,11 +436,7 @@ impl PeopleArguments {
         let for_s = Duration::try_from_secs_f64(self.for_s).map_err(Failure::usage)?;
         let capture = Capture::start(Arc::new(move || source.open(timeout)), capture)
             .context("cannot start the camera")?;
-        let mut watched = Watched {
-            people: Vec::new(),
-            others: BTreeSet::new(),
-            lens,
-        };
+        let mut watched = PeopleWatch::new(camera, lens, self.label.clone().into(), size);
         let end = Instant::now() + for_s;
         eprintln!("watches for {} s, or until the frames end", self.for_s);
         while let Ok(Some(frame)) =
@@ -457,56 +444,12 @@ impl PeopleArguments {
         {
             let detections = detector.detect(&frame).context("the detector failed")?;
             watched
-                .add(detections, &frame, &self.label, camera)
+                .add(detections, ImageSize::of(&frame.image))
                 .map_err(Failure::usage)?;
         }
         let readers = capture.readers();
         drop(capture);
         readers.wait_for_end(STOP_TIMEOUT);
         Ok(watched)
-    }
-}
-
-/// Results from a camera's frames.
-struct Watched {
-    /// Whole boxes of people by frame, without distortion.
-    people: Vec<Vec<BoundingBox>>,
-    /// Labels of everything else.
-    others: BTreeSet<Label>,
-    lens: Lens,
-}
-
-impl Watched {
-    fn add(
-        &mut self,
-        mut detections: Vec<Detection>,
-        frame: &CameraFrame,
-        label: &str,
-        camera: &CameraConfig,
-    ) -> anyhow::Result<()> {
-        let size = ImageSize::of(&frame.image);
-        self.lens = self.lens.of_frames(size)?;
-        ImageSize::from(&self.lens.intrinsics).fit(size, &mut detections)?;
-        let projection = Projection::new(
-            camera.projection.clone(),
-            self.lens.intrinsics,
-            camera.mount.into(),
-        );
-        self.others.extend(
-            detections
-                .iter()
-                .filter(|other| other.label != label)
-                .map(|other| other.label.clone()),
-        );
-        detections
-            .retain(|person| person.label == label && projection.cut(person) == Cut::default());
-        self.lens.undistort(&mut detections);
-        self.people.push(
-            detections
-                .iter()
-                .map(|person| person.bounding_box)
-                .collect(),
-        );
-        Ok(())
     }
 }

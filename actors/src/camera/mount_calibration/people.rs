@@ -1,0 +1,103 @@
+//! The mount of a camera from people who walk in front of it.
+
+use std::collections::BTreeSet;
+
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::names::Label;
+use ecod::perception::projection::{
+    Cut, MountEstimate, MountFitError, ObjectSize, Projection, fit_mount,
+};
+
+use crate::camera::config::CameraConfig;
+use crate::camera::image_size::{ImageSize, SizeMismatch};
+use crate::camera::lens::Lens;
+
+/// The whole boxes of people in a camera's frames.
+#[derive(Clone)]
+pub(crate) struct PeopleWatch {
+    camera: CameraConfig,
+    lens: Lens,
+    /// The detector's label of people.
+    label: Label,
+    /// Usual size of people, or the size of the one person who walks.
+    size: ObjectSize,
+    /// Boxes by frame, without distortion.
+    frames: Vec<Vec<BoundingBox>>,
+    others: BTreeSet<Label>,
+}
+
+impl PeopleWatch {
+    /// A watch without frames. `lens` is the lens of `camera`; `size` is the true size of objects
+    /// with this label.
+    pub(crate) fn new(camera: CameraConfig, lens: Lens, label: Label, size: ObjectSize) -> Self {
+        Self {
+            camera,
+            lens,
+            label,
+            size,
+            frames: Vec::new(),
+            others: BTreeSet::new(),
+        }
+    }
+
+    /// Adds the detections of a frame of this size. Boxes that the image's edge cuts are left out.
+    ///
+    /// # Errors
+    /// Returns [`SizeMismatch`] if the frame does not have the shape of the lens.
+    pub(crate) fn add(
+        &mut self,
+        mut detections: Vec<Detection>,
+        size: ImageSize,
+    ) -> Result<(), SizeMismatch> {
+        self.lens = self.lens.of_frames(size)?;
+        ImageSize::from(&self.lens.intrinsics).fit(size, &mut detections)?;
+        let projection = Projection::new(
+            self.camera.projection.clone(),
+            self.lens.intrinsics,
+            self.camera.mount.into(),
+        );
+        let others = detections.iter().filter(|other| other.label != self.label);
+        self.others.extend(others.map(|other| other.label.clone()));
+        detections.retain(|person| {
+            person.label == self.label && projection.cut(person) == Cut::default()
+        });
+        self.lens.undistort(&mut detections);
+        let boxes = detections.iter().map(|person| person.bounding_box);
+        self.frames.push(boxes.collect());
+        Ok(())
+    }
+
+    /// Number of frames.
+    pub(crate) fn frames(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Number of whole boxes of people.
+    pub(crate) fn boxes(&self) -> usize {
+        self.frames.iter().map(Vec::len).sum()
+    }
+
+    /// Labels of all other objects.
+    pub(crate) fn others(&self) -> &BTreeSet<Label> {
+        &self.others
+    }
+
+    /// The lens at the size of the latest frame.
+    pub(crate) fn lens(&self) -> &Lens {
+        &self.lens
+    }
+
+    /// Fits height, pitch and roll of the camera to the boxes; takes up to seconds.
+    ///
+    /// # Errors
+    /// Returns a [`MountFitError`] if the boxes do not determine the mount.
+    pub(crate) fn fit(&self) -> Result<MountEstimate, MountFitError> {
+        fit_mount(
+            &self.frames,
+            &self.size,
+            self.camera.projection.pixel_sigma_px,
+            &self.lens.intrinsics,
+            &self.camera.mount.into(),
+        )
+    }
+}
