@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks renewal soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check tables-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks renewal soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -77,6 +77,9 @@ eval-labels: setup ## accuracy of VOTE on label sets; the tables go into docs/re
 
 results-check: eval-labels ## fails if the tables of label sets in docs/results.md differ from the measured ones
 	git diff --exit-code docs/results.md
+
+tables-check: eval-labels eval-tracks eval-city liars ## measure all tables and drawings of docs/ that do not depend on the machine; fails if one changes
+	git diff --exit-code docs
 
 compare-labels: PACKAGES += python3-venv
 compare-labels: setup ## VOTE beside the methods of crowd-kit, from PyPI, on label sets; SETS=DIR
@@ -173,9 +176,9 @@ other-features: setup ## compile the node with other sets of features, and the f
 audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit
 
-snapshots: ## messages, help and error texts against their snapshots; INSTA_UPDATE=always writes these anew
+snapshots: ## messages, their schemas, help, error texts and tables of keys against their snapshots; INSTA_UPDATE=always writes these anew
 	cargo test --locked --quiet --test core messages::
-	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors::
+	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors:: configuration_reference:: schema::
 	cargo test --locked --quiet -p ecod-region --test engine -- help::
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV

@@ -48,7 +48,14 @@ macro_rules! config_section {
             $(, in $low:tt to $high:expr)? $(, checked by $check:expr)?;)*
     }) => {
         $(#[$attribute])*
-        #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+        #[derive(
+            Debug,
+            Clone,
+            PartialEq,
+            serde::Serialize,
+            serde::Deserialize,
+            schemars::JsonSchema,
+        )]
         #[serde(default, deny_unknown_fields)]
         pub struct $name {
             $($(#[$doc])* pub $field: $type,)*

@@ -39,7 +39,6 @@ pub enum PaceMode {
 
 config_section! {
     /// Parameters of PACE.
-    #[derive(JsonSchema)]
     pub struct PaceConfig {
         /// The implementation. Default `bayes`.
         pub mode: PaceMode = PaceMode::Bayes;

@@ -20,8 +20,6 @@ mod vehicle_clock;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use schemars::JsonSchema;
-
 use crate::admission::timeliness::Timeliness;
 use crate::config::config_section;
 use crate::model::names::NodeName;
@@ -31,7 +29,6 @@ use vehicle_clock::{Bounds, TimeBase, VehicleClock};
 
 config_section! {
     /// Admission of reports by age and clock.
-    #[derive(JsonSchema)]
     pub struct WindowConfig {
         /// Age in seconds beyond which a report is stale. Default 1.0. A higher value tolerates
         /// slower links; a lower value drops objects sooner.

@@ -1,5 +1,6 @@
 //! Settings of fusion.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::admission::report_window::WindowConfig;
@@ -11,7 +12,7 @@ use crate::tracking::{TracksConfig, TracksMode};
 use crate::vote::VoteConfig;
 
 /// The algorithms that a cell runs.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Algorithms {
     /// PACE: rounds produce maps.
@@ -36,11 +37,11 @@ impl Algorithms {
 }
 
 /// Settings of the fusion of a cell's reports.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
-    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts
-    /// with the first vote. Reports for an algorithm that does not run are rejected.
+    /// The algorithms that run: maps by PACE, and from the first vote on verdicts by VOTE. Default
+    /// `both`. Reports for an algorithm that does not run are rejected.
     pub algorithms: Algorithms,
     /// Admission of reports by age and clock.
     pub window: WindowConfig,

@@ -27,7 +27,6 @@ use crate::wire::ReportKind;
 
 config_section! {
     /// The interval of rounds.
-    #[derive(JsonSchema)]
     pub struct RoundConfig {
         /// Longest time between rounds in seconds, the paper's τ. Default 0.1.
         pub period_s: f64 = 0.1, in 0.005 to 60.0;

@@ -1,5 +1,6 @@
 //! The election's settings.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
@@ -8,7 +9,7 @@ use crate::wire::Role;
 /// Settings of the election on one node; `[election]` in the configuration file.
 ///
 /// The timings must be the same on every node of a cell. Role and priority are set per node.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ElectionConfig {
     /// Role of the node; taken from the node's `role`, not a key of this table. Default `auto`.

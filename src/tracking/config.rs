@@ -24,7 +24,7 @@ pub enum TracksMode {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct TracksConfig {
-    /// Cells that track objects: `auto` (default: cells without landmarks), `on` or `off`.
+    /// Cells that track objects; `auto` means cells without landmarks. Default `auto`.
     pub mode: TracksMode,
     /// Standard deviation in metres, in each direction, of near positions without covariance, until it
     /// is estimated; 0.012 m more for each metre of distance. Default 0.15.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range, config_section};
@@ -12,7 +13,7 @@ use crate::perception::landmark::check_synonyms;
 pub const MAX_LABELS: usize = 65_535;
 
 /// The method by which votes decide the label of a landmark.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
     /// Estimated reputation × calibrated confidence × visibility; the default.
@@ -23,7 +24,7 @@ pub enum VoteMode {
 }
 
 /// Settings of VOTE; an absent key has its default.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct VoteConfig {
     /// The voting method; default `weighted`.
@@ -32,9 +33,8 @@ pub struct VoteConfig {
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Maximum number of landmarks; beyond it an open cell drops the oldest landmark of the vehicle
-    /// that named most. Default 1024.
-    /// Bounds memory.
+    /// Maximum number of landmarks. Default 1024. Beyond it an open cell drops the oldest landmark
+    /// of the vehicle that named most. Bounds memory.
     pub max_landmarks: usize,
     /// Maximum number of vehicles. Beyond it vehicles that have been silent for long are dropped;
     /// if there are none, reports of new vehicles are rejected. Default 256. Bounds memory.

@@ -1,5 +1,6 @@
 //! JSON, CBOR and compact CBOR, which are distinguished by the first byte.
 
+use schemars::JsonSchema;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +11,7 @@ use super::{
 use crate::model::names::NodeName;
 
 /// The encoding of a payload.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Encoding {
     /// Text that people and all programming languages can read; the default.

@@ -7,6 +7,7 @@ use ecod::model::names::{NodeName, PART_MARK};
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::projection::{ProjectionConfig, Ranging};
 use ecod::perception::view::ViewConfig;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::calibrate::{Calibration, CalibrationError};
@@ -16,7 +17,7 @@ use super::frame_source::capture::CaptureConfig;
 use super::lens::Lens;
 
 /// A vehicle's camera and the processing of its frames.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
     /// Name of the camera, unique among the cameras of its vehicle. Default: not set; the camera
@@ -25,6 +26,7 @@ pub struct CameraConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Source of the camera's frames: a device, a stream or files.
+    #[schemars(with = "serde_json::Value")]
     pub source: SourceConfig,
     /// Stall timeout and retries of the source.
     #[serde(default)]
@@ -37,6 +39,7 @@ pub struct CameraConfig {
     #[serde(default)]
     pub mount: MountConfig,
     /// Detector of objects in frames.
+    #[schemars(with = "serde_json::Value")]
     pub detector: DetectorConfig,
     /// Projection of detections into the world.
     #[serde(default)]
@@ -57,26 +60,28 @@ fn yes() -> bool {
 }
 
 /// Image size and field of view, or a calibration file.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpticsConfig {
-    /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default: not set.
+    /// Calibration file of `ecod-node calibrate`, which replaces the other keys; frames of another
+    /// size are scaled, of another shape refused. Default: not set.
     pub calibration: Option<PathBuf>,
-    /// Image width in pixels. Default: not set. Without `height_px`, frames may have any shape.
+    /// Image width in pixels; without both sizes, frames may have any shape. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub width_px: Option<u32>,
     /// Image height in pixels. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_px: Option<u32>,
-    /// Horizontal field of view in degrees. Default 62.2, the Raspberry Pi Camera Module 2.
+    /// Horizontal field of view in degrees, by default of the Raspberry Pi Camera Module 2. Default
+    /// 62.2.
     pub horizontal_fov_deg: f64,
-    /// Vertical field of view in degrees. Default: not set; pixels are then square.
+    /// Vertical field of view in degrees; without it, pixels are square. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vertical_fov_deg: Option<f64>,
 }
 
 /// Position and attitude of the camera on the vehicle.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MountConfig {
     /// Metres ahead of the vehicle's reference point. Default 0.
@@ -85,8 +90,8 @@ pub struct MountConfig {
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in degrees, counter-clockwise. Default 0.
     pub pan_deg: f64,
-    /// Height of the camera above the ground in metres. Default: not set; the ground then gives no
-    /// distances.
+    /// Height of the camera above the ground in metres, which ranging by the ground needs. Default:
+    /// not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
     /// Angle of the axis below the horizon in degrees. Default 0.

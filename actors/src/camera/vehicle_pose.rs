@@ -8,16 +8,17 @@ use ecod::model::origin::{GeographicPose, StatedPose};
 use ecod::model::time::Timestamp;
 use ecod::wire::use_integers;
 use nalgebra::Point2;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 /// The vehicle's pose, in the cell's frame or on Earth; `[pose]` in the configuration file.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PoseConfig {
-    /// East in metres. Default 0.
+    /// Position east in metres. Default 0.
     pub x_m: f64,
-    /// North in metres. Default 0.
+    /// Position north in metres. Default 0.
     pub y_m: f64,
     /// Heading in degrees, counter-clockwise from east. Default 0.
     pub heading_deg: f64,
@@ -40,8 +41,7 @@ pub struct PoseConfig {
     /// stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<SocketAddr>,
-    /// False for a camera at the road, which is not an object of the map. Default true, a vehicle,
-    /// even while it stands.
+    /// False for a camera at the road, which is then no object of the map. Default: true.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub moving: Option<bool>,
 }

@@ -27,6 +27,7 @@ use ecod::wire::Role;
 use figment::providers::{Format, Serialized, Toml};
 use figment::value::{Dict, Map};
 use figment::{Figment, Metadata, Profile, Provider};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use self::cells::CellEntry;
@@ -47,35 +48,33 @@ use crate::transport::mqtt::{DataPlane, MqttConfig, Security, SecurityError};
 use crate::transport::pki::TlsConfig;
 
 /// All settings of a node.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct NodeConfig {
-    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name
-    /// for others.
+    /// Name of the node, unique in its cell and region: 1 to 64 of `A-Z a-z 0-9 _ -`. Default:
+    /// `edge` for an edge, otherwise the host name.
     pub name: Option<NodeName>,
     /// Name of the cell; messages of nodes of other cells are ignored. Default `cell`.
     pub cell: NodeName,
-    /// The node's role. Default `auto`.
+    /// The node's role; with `[tls]` at most the role in its certificate. Default `auto`.
     pub role: Role,
-    /// Address at which the embedded broker listens. Default: with `[tls]`, port 8883 on all
-    /// interfaces; without, port 1883 on 127.0.0.1, which other machines cannot reach, unless
-    /// `broker.allow_plaintext` is set. The broker takes a free port if the default port is in use.
+    /// Address of the embedded broker; without `[tls]`, other addresses than loopback need
+    /// `broker.allow_plaintext`. Default: port 8883 on all interfaces with `[tls]`, otherwise
+    /// 127.0.0.1:1883. The broker takes a free port if the default port is in use.
     pub listen: Option<SocketAddr>,
-    /// Directory for state that survives a restart: reputations and the highest term of leadership.
-    /// Default `$STATE_DIRECTORY`, which systemd sets. Without either, reputations end with the
-    /// node, and it receives the term from the other nodes.
+    /// Directory for reputations, the highest term and the description; without it reputations end
+    /// with the node. Default: `$STATE_DIRECTORY`, which systemd sets.
     pub state_dir: Option<PathBuf>,
-    /// The description of the cell with which a node that may lead starts a new cell. Default: not
-    /// set.
+    /// File with the first description of a cell, on a candidate. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub description: Option<PathBuf>,
-    /// A file to which every accepted map is appended with its time of receipt, one JSON object per
-    /// line. Default: not set.
+    /// File to which every accepted map is appended with its time of receipt, one JSON object per
+    /// line; at 512 MiB it is renamed to `….1`. Default: not set.
     pub map_log: Option<PathBuf>,
     /// The vehicle's pose. Default at the origin, looking east.
     pub pose: PoseConfig,
-    /// A file with the cells between which the vehicle moves by its position. Default: not set; the
-    /// vehicle stays in `cell`.
+    /// File with the cells between which the vehicle roams by its position; needs `pose.listen`.
+    /// Default: not set; the vehicle stays in `cell`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cells: Option<PathBuf>,
     /// Settings with which the nodes of the cell find and monitor each other.

@@ -4,6 +4,8 @@
 mod calibrate_mount;
 mod cli;
 #[cfg(feature = "camera")]
+mod configuration_reference;
+#[cfg(feature = "camera")]
 mod errors;
 mod example_configurations;
 #[cfg(feature = "camera")]

@@ -7,8 +7,7 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::wire::{RegionTopic, RegionTopicKind, Topic, Topics};
 
-const REGENERATE: &str =
-    "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test programs schema::";
+const REGENERATE: &str = "regenerate with: INSTA_UPDATE=always make snapshots";
 
 fn docs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs")
@@ -21,7 +20,7 @@ fn documented_schemas_match_code() {
     for (name, schema) in &schemas {
         let file = directory.join(format!("{name}.json"));
         let current = serde_json::to_string_pretty(schema).unwrap() + "\n";
-        if std::env::var_os("ECOD_WRITE_SCHEMAS").is_some() {
+        if std::env::var("INSTA_UPDATE").is_ok_and(|value| value == "always") {
             std::fs::write(&file, &current).unwrap();
         }
         let documented = std::fs::read_to_string(&file).unwrap_or_default();

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Point2;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Landmark, Synonym, VacancySign};
@@ -10,7 +11,7 @@ use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
 
 /// One entry of `landmarks` in the configuration: a location at which an object may stand.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LandmarkConfig {
     /// Name, unique in the cell.
@@ -49,7 +50,7 @@ pub(crate) fn check_synonyms(synonyms: &BTreeMap<Label, Label>) -> Result<(), Co
 }
 
 /// The table `vacancy` of a landmark: a sign that is in view while the location is empty.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct VacancyConfig {
     /// The text of the sign.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::coco_sizes;
@@ -12,7 +13,7 @@ use crate::model::names::Label;
 pub const NEURAL_PIXEL_SIGMA_PX: f64 = 3.0;
 
 /// The method of finding the distance of a detection.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
     /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and
@@ -45,7 +46,7 @@ impl Ranging {
 }
 
 /// The true size of a kind of object.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectSize {
     /// Width in metres; the side of a square target.
@@ -85,13 +86,14 @@ impl ObjectSize {
 }
 
 /// Object sizes by label.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectSizes {
-    /// Size of labels that are not listed, such as decoded texts. Default: no size. Labels of COCO
-    /// then have their usual sizes, and other labels have no position, unless the ground gives one.
+    /// Size of unlisted labels: `width_m`, `height_m` (0.0001–1000), `length_m` (0–1000; default
+    /// the width), `relative_sigma` (0–1; default 0.02). Default: no size. Labels of COCO then have
+    /// their usual sizes, and other labels have no position, unless the ground gives one.
     pub default: Option<ObjectSize>,
-    /// Sizes of listed labels; default empty.
+    /// Sizes by label; COCO labels have built-in sizes. Default: empty.
     pub labels: BTreeMap<Label, ObjectSize>,
 }
 

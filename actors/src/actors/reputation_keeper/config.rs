@@ -3,10 +3,11 @@
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Periods at which reputations are published, saved and replicated.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReputationKeeperConfig {
     /// Seconds between publications; changes are saved before each. Default 1. A higher value

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 use ecod::config::{ConfigError, check_range};
 use ecod::leadership::BrokerAddress;
 use ecod::wire::Encoding;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::platform::secret::Secret;
 use crate::transport::mqtt::MqttConfig;
 
 /// The broker of a region of cells, and the rate of maps to it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct UplinkConfig {
     /// The region's broker as `host:port`. Default: not set; the cell then has no connection to
@@ -25,9 +26,8 @@ pub struct UplinkConfig {
     pub user: Option<String>,
     /// Password. Default: not set. It is not printed.
     pub password: Option<Secret>,
-    /// Maps per second to the region; default 2, and five times as many while maps of a
-    /// neighbouring cell arrive. Trade-off: a higher rate costs bytes, and neighbours see
-    /// approaching objects sooner.
+    /// Maps per second to the region; five times as many while a neighbouring cell is active.
+    /// Default 2.
     pub max_hz: f64,
 }
 

@@ -3,24 +3,25 @@
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
 use ecod::config::{ConfigError, check_range};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::floor_plan::{FloorPlan, FloorPlanConfig};
 use crate::platform::secret::Secret;
 
 /// A node's web page, metrics and health.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct DashboardConfig {
     /// Whether page, metrics and health are served. Default true.
     pub enabled: bool,
-    /// Address and port of the page; port 0 takes a free one, which the log names. Default
-    /// [`DEFAULT_ADDRESS`], or a free port if that is in use. An address that other machines can
-    /// reach needs a token.
+    /// Address and port of the page; port 0 takes a free one, and the log names it. Default
+    /// 127.0.0.1:8080, or a free port if that is in use. An address that other machines can reach
+    /// needs a token.
     pub listen: Option<SocketAddr>,
-    /// Secret that gives access, at least 12 characters that need no escaping in an address.
-    /// Default: not set, which only a loopback address allows. Prefer `ECOD_DASHBOARD__TOKEN` to a
-    /// file that other users can read.
+    /// Secret of viewers, required unless `listen` is loopback: at least 12 visible ASCII
+    /// characters without `"#%&'<>`. Default: not set. Prefer `ECOD_DASHBOARD__TOKEN` to a file
+    /// that other users can read.
     pub token: Option<Secret>,
     /// Whether the page shows the pictures of the node's camera to users with access. Default true.
     pub camera: bool,
@@ -30,8 +31,8 @@ pub struct DashboardConfig {
     /// Maximum snapshots per second for each browser. Default 10. Trade-off: more snapshots show a
     /// fast cell better, fewer cost less.
     pub max_rate_hz: f64,
-    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others
-    /// briefly; at most half of them carry live snapshots.
+    /// Maximum number of connections, of which at most half are live pictures. Default 64. A
+    /// visible browser tab keeps one and opens others briefly.
     pub max_connections: usize,
 }
 

@@ -6,22 +6,24 @@ use bytes::Bytes;
 use ecod::config::ConfigError;
 use imagesize::ImageType;
 use nalgebra::Complex;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::platform::bounded_file;
 
 /// An image of the cell's ground from above, such as a floor plan or an aerial photograph.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FloorPlanConfig {
     /// PNG, JPEG or WebP file, 8 MiB at most.
     pub image: PathBuf,
-    /// Two points that determine scale, direction and place. They should be far apart.
+    /// Two points with `pixel` (column, row) and `position_m` (east, north), which determine scale,
+    /// direction and place.
     pub points: [FloorPlanPoint; 2],
 }
 
 /// A point of the image with a given position.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FloorPlanPoint {
     /// Column and row in pixels from the upper left corner.

@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::names::NodeName;
+use schemars::JsonSchema;
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// The log of a node; `record = "DIR"` is short for a table with `dir` alone.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(remote = "Self", default, deny_unknown_fields)]
 pub struct RecordConfig {
     /// Directory of the log, created if missing. Required.
@@ -25,16 +26,15 @@ pub struct RecordConfig {
     pub max_file_mb: u64,
     /// Maximum age of a file in seconds. Default 3600.
     pub max_file_s: u64,
-    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are
-    /// deleted first.
+    /// Maximum megabytes of this node's files in the directory; the oldest are deleted first.
+    /// Default 4096.
     pub max_total_mb: u64,
-    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and
-    /// losses are counted.
+    /// Free megabytes below which recording pauses. Default 256. Losses are counted; the disk is
+    /// checked every second.
     pub min_free_mb: u64,
     /// Maximum entries queued for the disk. Default 4096. Further entries are dropped and counted.
     pub queue: usize,
-    /// Whether to write scenes and transforms for Foxglove and Lichtblick. Default true. They
-    /// double the log.
+    /// Whether to write drawings for Foxglove and Lichtblick, which double the log. Default true.
     pub drawable: bool,
     /// Whether a node that cannot lead records all reports of its cell. Default false. A node that
     /// may lead always records them.

@@ -11,6 +11,7 @@ use ecod::config::{ConfigError, check_range};
 use rmqtt::context::ServerContext;
 use rmqtt::net::{Builder, Listener};
 use rmqtt::server::MqttServer;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::runtime;
@@ -86,7 +87,7 @@ pub enum BrokerError {
 }
 
 /// Limits of the embedded broker.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
     /// Whether local programs can connect to the cell at the node's own `listen` address,
@@ -104,9 +105,8 @@ pub struct BrokerConfig {
     /// one remote address; default 32. A node has one or two, and one for each observer. A cell
     /// behind address translation needs as many for each node.
     pub max_clients_each: usize,
-    /// Maximum messages waiting for one slow client; default 256. Beyond them, and beyond 2 MiB,
-    /// the oldest is dropped. A higher value bridges longer pauses of a client, but the client then
-    /// gets old messages.
+    /// Maximum messages waiting for one slow client, at most 2 MiB; the oldest is dropped. Default
+    /// 256.
     pub max_waiting: usize,
     /// Maximum topics with a retained message; default 8192: one for each node's status and one for
     /// the reputations.
@@ -115,8 +115,8 @@ pub struct BrokerConfig {
     /// bytes, reputations some hundred for each vehicle. Messages beyond it are forwarded and not
     /// retained.
     pub max_retained_bytes: usize,
-    /// True if the broker may listen on other than loopback addresses without `[tls]`; default
-    /// false. Every host that reaches it can then read everything and publish in any name.
+    /// Whether the broker may listen beyond loopback without `[tls]`: anyone who reaches it may
+    /// publish under any name. Default false.
     pub allow_plaintext: bool,
     /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees
     /// places sooner, longer admits slow boards and lossy networks.
@@ -124,12 +124,11 @@ pub struct BrokerConfig {
     /// Burst of connections of one address; default 64. A cell behind address translation needs two
     /// or more for each node.
     pub connect_burst: u32,
-    /// Connections per second of one address after the burst; default 10.
+    /// Connections per second of one address after the burst, tenfold after a login within the
+    /// hour. Default 10.
     pub connects_per_s: u32,
-    /// Maximum messages per second of one certificate; without certificates, of one address or
-    /// local client; default 1000. The same number is the burst. Further messages are dropped and
-    /// counted. A node sends some tens per second. Trade-off: a higher value lets a flood take the
-    /// processor time of other clients.
+    /// Maximum per second, and burst, of messages of one certificate, or without certificates of
+    /// one address or local client; more are dropped. Default 1000.
     pub max_messages_hz: u32,
 }
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::platform::secret::Secret;
@@ -16,58 +17,55 @@ pub const DEFAULT_PORT: u16 = 17_884;
 /// file.
 ///
 /// Key, multicast group and timings must be the same on every node of a cell.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MembershipConfig {
-    /// The cell's key: 64 hexadecimal digits (recommended, for example from
-    /// `openssl rand -hex 32`), or a passphrase of at least 12 characters. Default: not set; any
-    /// host can then join, and the node gossips on loopback only unless `bind` is set. It is not
-    /// printed.
+    /// The cell's key: 64 hexadecimal digits, as from `openssl rand -hex 32`, or a passphrase of at
+    /// least 12 characters. Default: not set.
     pub key: Option<Secret>,
-    /// A file with the key; white space around it is ignored. Default: not set. Excludes `key`.
+    /// File with the key, in place of `key`. Default: not set. White space around the key is
+    /// ignored.
     pub key_file: Option<PathBuf>,
-    /// Address and UDP port for gossip; port 0 takes any free one. Default port 17884, or a free
-    /// one if another node of this machine uses it, on all interfaces with a key and on 127.0.0.1
-    /// without. With an IPv6 address the whole cell gossips by IPv6, and nodes find each other by
-    /// `seeds` only; link-local addresses (`fe80::`) don't work.
+    /// Address and UDP port for gossip; port 0 takes any free one. Default: port 17884 or a free
+    /// one, on all interfaces with a key, otherwise on 127.0.0.1. Multicast needs an IPv4 address,
+    /// and IPv6 works by `seeds` only; link-local addresses (`fe80::`) don't work.
     pub bind: Option<SocketAddr>,
     /// Address at which other nodes reach this node, if address translation hides it. Default: not
     /// set; the address of `bind`, or the address that other nodes observe.
     pub advertise: Option<SocketAddr>,
-    /// Nodes as `host:port` through which this node finds the cell, in addition to multicast; they
-    /// are resolved and contacted repeatedly, without a time limit. Default: empty. Seeds may be
-    /// absent, and may differ between nodes.
+    /// Nodes as `host:port` to contact in addition to multicast. Default: empty. They are resolved
+    /// and contacted repeatedly, without a time limit. Seeds may be absent, and may differ between
+    /// nodes.
     pub seeds: Vec<String>,
     /// Settings of the discovery by multicast.
     pub multicast: MulticastConfig,
     /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects
     /// failures sooner and costs packets.
     pub probe_ms: u64,
-    /// Time within which a probed node must answer before other nodes probe it on this node's
-    /// behalf, in ms. Default 30; must be less than half of `probe_ms`. A longer time suits slower
-    /// networks.
+    /// Time in ms before other nodes probe for this one, less than half of `probe_ms`. Default 30.
+    /// A longer time suits slower networks.
     pub reply_ms: u64,
     /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off:
     /// longer declares fewer living nodes down and detects failures later.
     pub suspect_ms: u64,
     /// Time between two rounds of gossip, in ms. Default 50; rounds without news send no packets.
     pub gossip_ms: u64,
-    /// Time between two greetings, in ms, to every absent seed and to the multicast group. Once
-    /// other nodes are alive, the group is greeted a tenth as often. Default 500, and at most half
-    /// of the election's `join_ms`: a returning seed must discover its cell before it leads on its
-    /// own. Trade-off: a shorter time heals split cells sooner and costs packets.
+    /// Interval in ms between greetings to absent seeds and to the multicast group (tenfold for the
+    /// group once other nodes are alive); at most half of `join_ms`. Default 500. A returning seed
+    /// must discover its cell before it leads on its own. Trade-off: a shorter time heals split
+    /// cells sooner and costs packets.
     pub hello_ms: u64,
     /// Maximum number of other nodes. Default 256.
     pub max_peers: usize,
 }
 
 /// Discovery by UDP multicast, which needs no configured address.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MulticastConfig {
     /// Whether to send greetings and listen to them. Default true.
     pub enabled: bool,
-    /// The group. Default 239.255.36.84, of the range that routers keep local.
+    /// Address of the group. Default 239.255.36.84, of the range that routers keep local.
     pub group: Ipv4Addr,
     /// UDP port of the group. Default 17885. All nodes of a machine share it.
     pub port: u16,

@@ -6,49 +6,50 @@ use std::time::Duration;
 use ecod::config::{ConfigError, check_range};
 use ecod::leadership::BrokerAddress;
 use ecod::wire::{Encoding, Limits};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::platform::secret::Secret;
 
 /// Protocol, credentials and limits of the MQTT connections.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MqttConfig {
-    /// An external broker as `host:port`; default: not set, the brokers embedded in the nodes are
-    /// used.
+    /// External broker for all data as `host:port`; nodes then start no broker. Default: not set,
+    /// the brokers embedded in the nodes are used.
     pub broker: Option<BrokerAddress>,
-    /// Whether the embedded brokers are used in addition to an external one; default false.
-    /// Trade-off: the cell survives the loss of the external broker, and every message is sent
-    /// twice while it is available.
+    /// Whether the embedded brokers are used in addition to an external one: the cell survives the
+    /// loss of that broker, and every message travels twice. Default false. On several machines it
+    /// needs `[tls]` or `broker.allow_plaintext`.
     pub fallback_to_embedded: bool,
-    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized
-    /// packets away).
+    /// Protocol version; with 5 the broker keeps oversized packets away. Default 3.1.1, which every
+    /// broker supports.
     pub version: MqttVersion,
-    /// User name; default: not set. Needs `password`.
+    /// User name. Default: not set. Needs `password`.
     pub user: Option<String>,
-    /// Password; default: not set. It is not printed.
+    /// Password of `user`. Default: not set. It is not printed.
     pub password: Option<Secret>,
-    /// PEM file with the CAs of the external broker's certificate; default: not set, plaintext. The
-    /// host in `broker` must be a name in the certificate. A node with `[tls]` presents its own
-    /// certificate.
+    /// PEM file with the CAs of the external broker's certificate, which must match the host in
+    /// `broker`. Default: not set; the connection is in plaintext. A node with `[tls]` presents its
+    /// own certificate.
     pub ca: Option<PathBuf>,
-    /// Whether payloads are signed with the cell's key and unsigned ones rejected; default false.
-    /// For an external broker that other parties use too. Must be equal on every node. Other
-    /// subscribers have to skip the signature.
+    /// Whether payloads are signed with the cell's key and unsigned ones rejected; equal on all
+    /// nodes. Default false. For an external broker that other parties use too. Other subscribers
+    /// have to skip the signature.
     pub sign: bool,
-    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of
-    /// numbers) or `"compact"` (a quarter of the bytes, rounded to millimetres and 0.05 %).
+    /// Encoding of sent payloads; nodes read all three, and `compact` rounds to millimetres and
+    /// 0.05 %. Default `json`.
     pub encoding: Encoding,
-    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off:
-    /// shorter notices a dead network path sooner and costs packets. Not the failure detector,
-    /// which is the gossip.
+    /// Silence in seconds after which the broker is pinged, from 5 with version 5. Default 5.
+    /// Trade-off: shorter notices a dead network path sooner and costs packets. Not the failure
+    /// detector, which is the gossip.
     pub keep_alive_s: u16,
     /// Milliseconds within which a broker must accept a connection; default 2000.
     pub connect_timeout_ms: u64,
     /// Milliseconds before the first attempt to reconnect, doubled with every failure; default 50.
     pub retry_min_ms: u64,
-    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to
-    /// half is taken off each wait, so that a cell's vehicles do not return all at once.
+    /// Longest wait between attempts to reconnect, of which a random part of up to half is taken
+    /// off. Default 2000. A cell's vehicles thus do not return all at once.
     pub retry_max_ms: u64,
     /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are
     /// refused and counted.
@@ -56,16 +57,16 @@ pub struct MqttConfig {
     /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones
     /// are dropped and counted.
     pub inbox: usize,
-    /// Maximum reports per second of one vehicle and kind, where the largest count sixfold, shares of
-    /// evidence of one candidate, and statuses of one node; default 100. The same number is the burst. Further ones are not
-    /// decoded, and counted by node. Trade-off: a higher value lets one node take the processor
-    /// time of others.
+    /// Maximum per second, and burst, of reports of one vehicle and kind (the largest count
+    /// sixfold), evidence shares of one candidate, or statuses of one node; more are counted and
+    /// not decoded. Default 100. Trade-off: a higher value lets one node take the processor time of
+    /// others.
     pub max_report_hz: u32,
     /// Largest report or status in bytes that is decoded; default 262144.
     pub max_payload_bytes: usize,
-    /// Largest map, verdicts or reputations in bytes that are sent and decoded; default 8388608,
-    /// 512 bytes for each of 16,384 locations. Trade-off: a larger value admits larger cells, a
-    /// smaller one limits the size of an attacker's messages.
+    /// Largest map, verdicts or reputations that are sent and decoded: 512 bytes for each of 16,384
+    /// landmarks; equal on all nodes. Default 8388608. Trade-off: a larger value admits larger
+    /// cells, a smaller one limits the size of an attacker's messages.
     pub max_map_bytes: usize,
     /// Maximum objects, and maximum seen landmarks, in a report; default 1024.
     pub max_objects: usize,
@@ -191,7 +192,7 @@ const PACKET_OVERHEAD_BYTES: usize = 4096;
 const MAX_PAYLOAD_BYTES: f64 = 268_000_000.0;
 
 /// A version of the MQTT protocol.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum MqttVersion {
     /// MQTT 3.1.1.
     #[default]

@@ -3,11 +3,12 @@
 use std::path::PathBuf;
 
 use ecod::config::ConfigError;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The files that `ecod-node pki` made for a node, in PEM. They are read again when they change,
 /// without a restart.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TlsConfig {
     /// The certificate of the cell's CA.
@@ -26,7 +27,7 @@ pub struct TlsConfig {
 }
 
 /// The files that `ecod-node pki city` made for all cells of a city, in PEM.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CityTlsConfig {
     /// The certificate of the city's CA.
