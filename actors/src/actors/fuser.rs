@@ -389,7 +389,7 @@ impl FuserState {
         match self.aggregator.knows_location(id) {
             Some(true) => {}
             Some(false) => {
-                let cause = format!("names the location “{id}”, which this node does not know");
+                let cause = format!("names the location “{id}”, which this node does not have");
                 troubles.record_about(node, TroubleKind::UnknownLocation, &cause);
             }
             // Votes name locations themselves where no list is configured.
