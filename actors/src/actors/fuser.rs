@@ -446,6 +446,8 @@ impl FuserState {
         self.tick();
     }
 
+    /// Handles the alarm and a new leadership: closes the round if its deadline has passed, publishes
+    /// the results while leading, and records the tick. Before the deadline nothing changes.
     fn tick(&mut self) {
         self.command(Command::Tick);
     }
