@@ -4,7 +4,7 @@
 //!
 //! ```text
 //! cli          the program
-//! doctor, top  what an operator asks
+//! doctor, top  checks and live figures for operators
 //! node         supervisor and configuration of a whole node
 //! actors       one file or folder per actor
 //! observe      page, metrics, health, logs, reports

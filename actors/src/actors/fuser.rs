@@ -447,7 +447,7 @@ impl FuserState {
     }
 
     /// Handles the alarm and a new leadership: closes the round if its deadline has passed, publishes
-    /// the results while leading, and records the tick. Before the deadline nothing changes.
+    /// the results while leading, and records the tick. Before the deadline it has no effect.
     fn tick(&mut self) {
         self.command(Command::Tick);
     }

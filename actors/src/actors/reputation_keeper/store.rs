@@ -42,7 +42,7 @@ impl ReputationStore {
     }
 
     /// Loads saved evidence, within the bounds for other nodes' evidence. If evidence is signed,
-    /// `signer` verifies it. `date` is the current time; if the clock was never set, checks against
+    /// `signer` verifies it. `date` is the current time; without a set clock, checks against
     /// it are skipped.
     fn adopt(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
         let Saved {
