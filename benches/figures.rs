@@ -23,7 +23,7 @@ impl Figures {
         self.values.insert(name.into(), value);
     }
 
-    /// Takes whether a goal was met, and says so.
+    /// Records whether a goal was met, and prints it.
     #[allow(dead_code, reason = "not every benchmark has a goal")]
     pub(crate) fn goal(&mut self, name: &str, figure: f64, goal: f64, unit: &str) {
         let met = figure <= goal;

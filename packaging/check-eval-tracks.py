@@ -196,7 +196,7 @@ def main():
         for figure, value in expected[name].items():
             check(f"{name} {figure}", ours[name][figure], value)
         other = motmetrics_figures(kept)
-        # motmetrics matches as many as it can before it looks at distances: one pair in a thousand may differ.
+        # motmetrics matches as many as it can before it compares distances: one pair in a thousand may differ.
         check(f"{name} mota (motmetrics)", ours[name]["mota_pct"], 100 * other["mota"], 0.1)
         check(f"{name} motp (motmetrics)", ours[name]["motp_m"], other["motp"], 1e-3)
         check(f"{name} idf1 (motmetrics)", ours[name]["idf1_pct"], 100 * other["idf1"], 0.1)

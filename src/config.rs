@@ -5,22 +5,53 @@ use std::fmt::Display;
 
 /// A configuration value that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("configuration key `{key}`: {value} is not allowed, must be {allowed}")]
+#[error("configuration key `{key}`{fault}, must be {allowed}")]
 pub struct ConfigError {
     /// Full key, such as `pace.gate_m`.
     pub key: String,
-    /// The value found, as text.
-    pub value: String,
+    /// Why the value cannot be used.
+    pub fault: ValueFault,
     /// The allowed values as a phrase, such as `a number from 0.1 to 100`.
     pub allowed: String,
 }
 
+/// Why a configuration value cannot be used. Its text follows the key in an error message.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ValueFault {
+    /// The value found, as text.
+    #[error(": {0} is not allowed")]
+    NotAllowed(String),
+    /// The key has no value.
+    #[error(" is missing")]
+    Missing,
+    /// The text is too short. Errors do not show it, because it may be a secret.
+    #[error(" is too short")]
+    TooShort,
+    /// The IP address is 0.0.0.0 or `::`, or the port is 0.
+    #[error(" is unspecified")]
+    Unspecified,
+}
+
 impl ConfigError {
-    /// An error about one key.
+    /// An error about one key with the value found.
     pub fn new(key: impl Into<String>, value: impl Display, allowed: impl Into<String>) -> Self {
+        Self::with_fault(key, ValueFault::NotAllowed(value.to_string()), allowed)
+    }
+
+    /// An error about one key without a value.
+    pub fn missing(key: impl Into<String>, allowed: impl Into<String>) -> Self {
+        Self::with_fault(key, ValueFault::Missing, allowed)
+    }
+
+    /// An error about one key with a fault of its value.
+    pub fn with_fault(
+        key: impl Into<String>,
+        fault: ValueFault,
+        allowed: impl Into<String>,
+    ) -> Self {
         Self {
             key: key.into(),
-            value: value.to_string(),
+            fault,
             allowed: allowed.into(),
         }
     }

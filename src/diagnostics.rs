@@ -104,7 +104,7 @@ trouble_kinds! {
     /// More messages than are accepted.
     Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`; for more vehicles `fusion.window.max_vehicles`";
     /// The connection of a client to this node's broker stands still in both directions.
-    NetworkCut = "network_cut", LONG, "look at the network between both, and whether its machine runs";
+    NetworkCut = "network_cut", LONG, "check the network between both, and whether its machine runs";
     /// A node of this cell with another key.
     WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";
     /// A node of a cell whose name is nearly this one's.
@@ -128,13 +128,13 @@ trouble_kinds! {
     /// A broker that refuses a necessary operation of this node.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
     /// The region's broker cannot be reached.
-    UplinkUnreachable = "uplink_unreachable", LONG, "look at the link to the region, and whether its broker runs; the cell goes on without it";
+    UplinkUnreachable = "uplink_unreachable", LONG, "check the link to the region, and whether its broker runs; the cell works without the region";
     /// An uplink of a cell that has no place on Earth.
     NoOrigin = "no_origin", UNTIL_SETTLED, "set `[origin]` in the cell's description: `ecod-node cell set`";
     /// A cell to which the vehicle cannot move.
     CellLeftOut = "cell_left_out", UNTIL_SETTLED, "correct its entry in the file of `cells` and the files that it names: `ecod-node doctor` tries all";
     /// More troubles than are kept.
-    NotShown = "not_shown", SHORT, "mend those that are shown, others then have room";
+    NotShown = "not_shown", SHORT, "correct the troubles that are shown; others then appear";
     /// Entries that are missing in the log.
     NotRecorded = "not_recorded", SHORT, "free space on the disk of `record.dir`, and make the directory writable for the node's user";
     /// State that cannot be saved.

@@ -415,6 +415,8 @@ impl Replay {
         }
     }
 
+    /// Closes the round that is due at `now`, in recorded time, and appends its results to `output`. No
+    /// round is pending until the next report.
     fn tick(&mut self, now: Timestamp, output: &mut Vec<FusedLine>) {
         let fused = self.cell.as_mut().and_then(|cell| cell.tick(now));
         self.pending = false;

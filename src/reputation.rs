@@ -5,9 +5,9 @@
 //! lane: it is idempotent, commutative and associative. Two partitions that counted separately
 //! merge to the sum of their votes.
 //!
-//! Marks allow old votes to be dropped: a mark holds a vehicle's counts at an earlier number of
-//! votes. It is written once. The latest mark alone decides which marks are kept, so that merging
-//! them is a join too.
+//! A mark stores a vehicle's counts at an earlier number of votes, so that older votes can be
+//! dropped. A mark never changes. Only the latest mark determines which marks are kept, so merging
+//! marks is also a join.
 
 mod ledger;
 mod marks;
@@ -27,14 +27,14 @@ use crate::config::config_section;
 use crate::model::names::{Label, NodeName};
 use crate::wire::MAX_INTEGER;
 
-/// A settled vote: it is final whether the vote agreed with the verdict.
+/// A settled vote: its agreement with the verdict no longer changes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Evidence {
     /// Vehicle that voted.
     pub node: NodeName,
     /// The label that it stated.
     pub label: Label,
-    /// True if the verdict was the same.
+    /// True if the verdict has the stated label.
     pub correct: bool,
 }
 

@@ -4,11 +4,11 @@
 //!
 //! ```text
 //! cli          the program
-//! doctor, top  what an operator asks
+//! doctor, top  checks and live figures for operators
 //! node         supervisor and configuration of a whole node
 //! actors       one file or folder per actor
 //! observe      page, metrics, health, logs, reports
-//! messages     what actors say to each other
+//! messages     messages between actors
 //! transport    MQTT, embedded broker, gossip, certificates     camera  frames, detectors, lens
 //! telemetry    counters
 //! platform     clock, files, throttles

@@ -1,4 +1,4 @@
-//! A cell's aggregator hears sequences of valid reports, however contrary; what it publishes is valid.
+//! A cell's aggregator receives sequences of valid reports, however contrary; what it publishes is valid.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! What a stranger sends to a broker first, before anybody asks who it is.
+//! First packets of a client that the broker has not authenticated.
 
 #![no_main]
 

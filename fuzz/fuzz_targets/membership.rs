@@ -1,5 +1,5 @@
-//! A node of the membership hears datagrams of strangers, of a holder of the key that says anything with it, and of a
-//! node that signs anything in its handshakes.
+//! A node of the membership receives datagrams of strangers, arbitrary messages sealed by a holder of the key, and
+//! arbitrary handshakes signed by a node.
 
 #![no_main]
 

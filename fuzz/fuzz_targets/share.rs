@@ -1,4 +1,4 @@
-//! Shares of the ledger: nobody forges one, and what is taken stays within bounds.
+//! Shares of the ledger: none can be forged, and accepted ones stay within bounds.
 
 #![no_main]
 

@@ -7,7 +7,7 @@
 use ecod_actors::transport::broker::read_websocket;
 use libfuzzer_sys::fuzz_target;
 
-/// A handshake without its first byte, which the broker takes to tell it from MQTT.
+/// A handshake without its first byte, which the broker reads to distinguish it from MQTT.
 const HANDSHAKE: &[u8] = b"ET / HTTP/1.1\r\nHost: 127.0.0.1:1883\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
 Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: mqtt\r\n\r\n";
 

@@ -215,6 +215,9 @@ impl CpmBridge {
         Ok(())
     }
 
+    /// Handles a CPM of a receiver: decodes the message into the cell's frame and reports its objects to
+    /// the cell under the station's place. The bridge's own messages are refused, and so are messages
+    /// with a reference time too far from the present.
     fn on_message(
         &self,
         stations: &mut Stations<'_>,

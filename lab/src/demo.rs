@@ -4,7 +4,7 @@
 //! ```text
 //! demo ── spawns ──> ecod-node --role edge
 //!      ── spawns ──> ecod-node --role auto × n  (each plays rendered frames, detects, projects, publishes, logs the maps it gets)
-//!      ── listens to every report on all brokers, to tell what each vehicle would have known alone
+//!      ── listens to every report on all brokers, to compute what each vehicle would have detected alone
 //!      ── kills the edge half-way and starts it again a second later
 //! ```
 

@@ -193,6 +193,9 @@ impl RegionTown {
         accepted
     }
 
+    /// Handles a message of the region's broker: a map, description or status replaces the stored one of
+    /// its cell, and an empty status removes the cell. For example, the first status of a leader after
+    /// `offline` starts the time for which the cell leads. Refused messages change only counters.
     fn on_message(
         &mut self,
         path: &str,

@@ -256,6 +256,8 @@ impl Election {
         self.terms.seen
     }
 
+    /// Begins each input: advances the node's awake clock to `now` and returns its time. Time beyond
+    /// the deadline plus the tolerance does not count, so a stalled node gives up no leader.
     fn advance(&mut self, now: Timestamp) -> Timestamp {
         self.clock.advance(now, self.deadline())
     }

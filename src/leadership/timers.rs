@@ -313,7 +313,7 @@ mod tests {
             (
                 config.near_beat(),
                 config.response_timeout(),
-                "second successors hear of changes",
+                "second successors receive changes in time",
             ),
             (
                 config.idle_beat() * 2,
@@ -325,13 +325,13 @@ mod tests {
             (
                 ELECTED_SILENCE,
                 SUCCESSOR_CREDIT,
-                "word of the election comes in time",
+                "election results arrive in time",
             ),
             (SUCCESSOR_CREDIT, EPOCH_MEMORY, "forged epochs end"),
             (
                 EPOCH_MEMORY,
                 LEADER_DELAY_MEMORY,
-                "a leader that comes back is known",
+                "the delay of a returning leader is still stored",
             ),
             (MAX_ROUND_AGE, EPOCH_MEMORY, "no queued round returns"),
             (MAX_ROUND_WAIT, MAX_ROUND_AGE, "the way takes the rest"),
@@ -372,7 +372,7 @@ mod tests {
             (
                 CONNECT_TIME,
                 VEHICLE_CONNECT_TIME,
-                "a planned handover waits for everybody",
+                "a planned handover waits for all nodes",
             ),
             (
                 VEHICLE_CONNECT_TIME,
@@ -382,7 +382,7 @@ mod tests {
             (
                 LOGIN_TIMEOUT + HEALTH_PERIOD,
                 config.stable(),
-                "nobody is handed a lead in vain",
+                "the new leader's broker is reachable before the handover",
             ),
             (
                 LEDGER_TIMEOUT,
@@ -424,12 +424,12 @@ mod tests {
             (
                 config.response_timeout(),
                 RENEWAL_PAUSE,
-                "a renewal is heard by all before the next",
+                "all nodes receive a renewal before the next",
             ),
             (
                 FULL_RESYNC_PAUSE,
                 Duration::from_secs(10),
-                "a new leader is told before the next snapshot",
+                "a new leader receives evidence before the next snapshot",
             ),
         ] {
             assert!(

@@ -75,7 +75,7 @@ impl GeographicPose {
     }
 }
 
-/// A vehicle's pose as somebody states it.
+/// A vehicle's pose as configuration or a program states it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum StatedPose {
     /// In the cell's frame.

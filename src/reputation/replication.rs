@@ -488,7 +488,7 @@ mod tests {
         assert!(!copy.merge_entries([told.clone()], None));
         assert!(
             copy.merge_entries([told], Some(&present)),
-            "nor does it at whoever follows"
+            "nor does it at a later leader"
         );
     }
 

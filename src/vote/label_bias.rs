@@ -1,5 +1,5 @@
-//! How much vehicles differ in the labels that they prefer, and how much therefore speaks for a
-//! confusion matrix of each vehicle.
+//! How much vehicles differ in the labels that they prefer, and how much this supports a confusion
+//! matrix of each vehicle.
 //!
 //! Whether a vehicle is right equally often on every class, or on some classes more often, cannot
 //! be read from verdicts: a model with classes can predict votes better even if its classes are not

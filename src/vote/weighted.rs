@@ -400,6 +400,8 @@ impl VotingMethod for WeightedVoting {
             .is_none_or(|&vehicle| self.model.reliability(vehicle) > 0.5)
     }
 
+    /// Begins a leadership at `now`: drops collected evidence and restarts the period of every vote.
+    /// Votes before `now` still count in verdicts but yield no evidence when they settle.
     fn begin_record(&mut self, now: Timestamp) {
         self.recorded_from = now;
         self.evidence.clear();

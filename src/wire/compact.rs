@@ -1,9 +1,8 @@
 //! The compact encoding: CBOR with structs as arrays and with rounded numbers of few bytes.
 //!
-//! The number `n` at a field of a payload is its index in the array. The meaning of an index is
-//! fixed; new fields are appended. An absent field is null, or left out at the end; readers skip
-//! unknown indices. Readers take every number as an integer or a float of any width; its [`Form`]
-//! decides how it is written.
+//! `#[n(…)]` is the field's array index. The meaning of an index is fixed; new fields are appended.
+//! An absent field is null, or left out at the end; readers skip unknown indices. Readers accept an
+//! integer or a float of any width; the field's [`Form`] determines how a number is written.
 
 mod number;
 

@@ -26,7 +26,7 @@ pub struct LedgerShare {
     /// Counts, at most 512.
     #[n(3)]
     pub entries: Vec<LedgerEntry>,
-    /// Marks, at most 512. Without marks a receiver cannot tell which votes are recent.
+    /// Marks, at most 512. Without marks a receiver cannot determine which votes are recent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(4), default)]
     pub marks: Vec<LedgerMark>,

@@ -1,7 +1,7 @@
 //! The actor that accepts the cell's maps, verdicts and reputations.
 //!
 //! ```text
-//! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watches of the newest of each; maps also to an optional log file
+//! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watch channels with the newest message of each kind; maps also to an optional log file
 //!                                            ├── RoundAccepted ──> LeaderElection
 //!                                            ├── TakeMap ──> Fuser
 //!                                            └── everything accepted ──> Door ──> programs beside the node
@@ -246,8 +246,8 @@ impl FollowerState {
         Ok(())
     }
 
-    /// Handles reputations: accepted ones go to recording, watchers and local programs. They are no
-    /// sign of life, because brokers retain them.
+    /// Handles reputations: accepted ones go to recording, watchers and local programs. Reputations
+    /// are not a sign of life of the leader, because brokers retain them.
     ///
     /// # Errors
     /// Returns the reason why the filter refused the reputations.

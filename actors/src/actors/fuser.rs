@@ -389,7 +389,7 @@ impl FuserState {
         match self.aggregator.knows_location(id) {
             Some(true) => {}
             Some(false) => {
-                let cause = format!("names the location “{id}”, which this node does not know");
+                let cause = format!("names the location “{id}”, which this node does not have");
                 troubles.record_about(node, TroubleKind::UnknownLocation, &cause);
             }
             // Votes name locations themselves where no list is configured.
@@ -446,6 +446,8 @@ impl FuserState {
         self.tick();
     }
 
+    /// Handles the alarm and a new leadership: closes the round if its deadline has passed, publishes
+    /// the results while leading, and records the tick. Before the deadline it has no effect.
     fn tick(&mut self) {
         self.command(Command::Tick);
     }

@@ -53,7 +53,7 @@ pub struct MembershipArguments {
     /// Address of the node's broker, if it has one. Other nodes replace 0.0.0.0 by the address from
     /// which the node's packets arrive.
     pub broker: Option<SocketAddr>,
-    /// The node's certificates. With them, all nodes of the cell prove theirs.
+    /// The node's certificates. If set, every node of the cell must prove its certificate.
     pub credentials: Option<Arc<Credentials>>,
     /// Timings, seeds and limits.
     pub config: MembershipConfig,
@@ -268,8 +268,8 @@ impl MembershipState {
         self.handled.notify_one();
     }
 
-    /// Moves when this machine has lost the node's address, such as after a new lease
-    /// of a DHCP server.
+    /// Switches to another local address when this machine has lost the current one, for example
+    /// after a new DHCP lease.
     fn check_address(&mut self, now: Timestamp) {
         let own = self.machine.own_address().ip();
         if is_of_this_machine(own) {
@@ -454,7 +454,8 @@ async fn check_certificates(
 /// Maximum datagrams before due timers run, even in a flood.
 const MAX_DATAGRAMS_PER_WAKE: usize = 1024;
 
-/// Wakes the actor when datagrams wait or a timer is due, and again only once it has handled that.
+/// Wakes the actor when datagrams wait or a timer is due; the next `Wake` follows only after the
+/// actor has handled this one.
 async fn watch_socket(
     socket: Arc<GossipSocket>,
     mut deadline: watch::Receiver<Option<Timestamp>>,
@@ -486,7 +487,7 @@ const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     if config.enabled && socket.address().is_ipv6() {
         tracing::warn!(
-            "key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`"
+            "`membership.bind` is an IPv6 address: multicast discovery is unavailable, set `membership.seeds`"
         );
     }
     match socket.join(config) {
@@ -527,12 +528,12 @@ fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: Socke
     if config.has_key() && proves {
         tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
     } else if config.has_key() {
-        tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for");
+        tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not required");
     } else if address.ip().is_loopback() {
         tracing::info!(%address, "looking for nodes on this machine only: no cell key is set");
     } else if proves {
         tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set");
     } else {
-        tracing::warn!(%address, "looking for nodes of anyone: no cell key is set");
+        tracing::warn!(%address, "accepting any node: no cell key is set");
     }
 }

@@ -213,7 +213,7 @@ impl ProjectorState {
         let Some(pose) = pose else {
             self.troubles.record(
                 TroubleKind::NoPose,
-                "no pose is known near the time of the camera's frames",
+                "no pose is available near the time of the camera's frames",
             );
             return self.counters.count(Event::FrameWithoutPose);
         };

@@ -438,7 +438,7 @@ impl UplinkState {
 
 /// The cause of [`TroubleKind::NoOrigin`].
 const NO_ORIGIN: &str =
-    "`uplink.broker` is set, and the cell has no origin: the region cannot tell where it is";
+    "`uplink.broker` is set, but the cell has no origin: the region cannot place the cell";
 
 /// Callback that sends a link's events to the uplink itself.
 fn events_to(uplink: &ActorRef<UplinkMessage>) -> LinkSink {

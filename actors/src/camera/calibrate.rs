@@ -23,15 +23,15 @@ use crate::platform::bounded_file;
 /// Minimum number of photographs that show the whole board.
 pub const MIN_VIEWS: usize = 5;
 
-/// Numbers of coefficients of OpenCV's polynomial models without and with k3, and of the rational
-/// one.
+/// Allowed numbers of distortion coefficients: 4 without k3, 5 with k3, 8 for OpenCV's rational
+/// model.
 const COEFFICIENT_COUNTS: [usize; 3] = [4, 5, 8];
 
-/// Fields of view of real lenses, in degrees: a focal length in millimetres or in shares of the
-/// image is beyond.
+/// Plausible fields of view in degrees. A focal length in millimetres or as a fraction of the image
+/// falls outside.
 const PLAUSIBLE_FOV_DEG: RangeInclusive<f64> = 0.2..=175.0;
 
-/// Places of the principal point, in shares of the image.
+/// Plausible range of the principal point, as a fraction of the image size.
 const PLAUSIBLE_MIDDLE: RangeInclusive<f64> = 0.02..=0.98;
 
 /// A printed chessboard, whose inner corners are found in photographs.

@@ -159,7 +159,7 @@ impl CameraConfig {
             .map_err(|error| error.within("mount"))?;
         if self.projection.ranging == Ranging::Ground && self.mount.height_m.is_none() {
             let allowed = "the camera's height above the ground, by which `projection.ranging = \"ground\"` places objects";
-            return Err(ConfigError::new("mount.height_m", "nothing", allowed));
+            return Err(ConfigError::missing("mount.height_m", allowed));
         }
         self.detector
             .validate()

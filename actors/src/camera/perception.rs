@@ -255,7 +255,7 @@ impl Perception {
         let off_deg = self.mount_off_rad?.to_degrees();
         let side = if off_deg > 0.0 { "higher" } else { "lower" };
         Some(format!(
-            "the camera looks {:.0}° {side} than its mount says, judged by objects on the ground",
+            "the camera looks {:.0}° {side} than its mount states, judged by objects on the ground",
             off_deg.abs()
         ))
     }

@@ -103,7 +103,7 @@ impl PoseConfig {
             {
                 let allowed = "a number: a pose on Earth has `latitude_deg`, `longitude_deg` and `azimuth_deg`, its \
                                heading clockwise from true north";
-                Err(ConfigError::new(*key, "nothing", allowed))
+                Err(ConfigError::missing(*key, allowed))
             }
             _ => Ok(()),
         }
@@ -229,10 +229,10 @@ fn in_map(fix: &Value) -> Result<StatedPose, String> {
 fn in_words(error: ConfigError) -> String {
     let ConfigError {
         key,
-        value,
+        fault,
         allowed,
     } = error;
-    format!("`{key}`: {value} is not allowed, must be {allowed}")
+    format!("`{key}`{fault}, must be {allowed}")
 }
 
 #[cfg(test)]
@@ -353,7 +353,7 @@ mod tests {
             "{stated:?}"
         );
         for (more, parts) in [
-            ("", ["`azimuth_deg`", "nothing"]),
+            ("", ["`azimuth_deg`", "missing"]),
             ("azimuth_deg = 400", ["`azimuth_deg`", "400"]),
             (
                 "azimuth_deg = 90\nx_m = 2",

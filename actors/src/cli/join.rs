@@ -173,9 +173,9 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     directory.hand_over_pki()?;
     print(&format!(
         "made the cell {cell} and its node {name} in {directory}\n\
-         keep {}/ca.key safe: whoever has it can let nodes in\n\
-         let others in: {}\n\
-         while it runs, tell it the known locations: ecod-node cell set --config {} cell.toml\n",
+         keep {}/ca.key secret: it admits nodes to the cell\n\
+         admit another node: {}\n\
+         while the node runs, set the cell's known locations: ecod-node cell set --config {} cell.toml\n",
         directory.pki().display(),
         directory.command("invite NAME"),
         directory.configuration().display()
@@ -267,7 +267,7 @@ pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
                 directory.vacate()?;
             }
             let again = "run `ecod-node join` again with the same token while `ecod-node invite` still runs there";
-            return Err(anyhow!(error).context(format!("the host does not know that {node} has joined: {again}")));
+            return Err(anyhow!(error).context(format!("the host has no confirmation that {node} has joined: {again}")));
         }
         anyhow::Ok(cell)
     })?;
@@ -292,7 +292,7 @@ impl NodeArguments {
         }
         if directory.enable_service()? {
             return Ok(print(
-                "the service ecod-node is enabled and runs; `systemctl status ecod-node` tells more\n",
+                "the service ecod-node is enabled and runs; details: `systemctl status ecod-node`\n",
             )?);
         }
         let configuration = directory.configuration();

@@ -55,9 +55,13 @@ impl Logs {
             .join(", ");
         match node {
             Some(node) if !nodes.contains(node) => {
-                let others = if nodes.is_empty() { "nobody" } else { &names };
+                let others = if nodes.is_empty() {
+                    ", nor of another node".to_owned()
+                } else {
+                    format!(", but of {names}")
+                };
                 return Err(Failure::usage(anyhow!(
-                    "there is no log of {node} here, but of {others}"
+                    "there is no log of {node} here{others}"
                 )));
             }
             None if nodes.len() > 1 => {

@@ -37,7 +37,7 @@ pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
     let name = config
         .name
         .as_ref()
-        .ok_or_else(|| missing("name", "not set, so the node's files are not known"))?;
+        .ok_or_else(|| missing("name", "not set, so the node's files cannot be found"))?;
     let file = |what: &str| StateFile::new(directory, &config.cell, name, what);
     let _lock = StateFile::lock(directory, &config.cell, name).with_context(|| {
         format!("{name} runs and would write its state again; stop it, and repeat the command")

@@ -43,7 +43,7 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
             return vec![Finding::broken(
                 "cell",
                 error.to_string(),
-                "mend what the other checks name",
+                "correct what the other checks name",
             )];
         }
     };
@@ -126,7 +126,7 @@ fn used_elsewhere(config: &NodeConfig, member: &Member) -> Option<Finding> {
         Finding::broken(
             "name",
             seen,
-            "give this node another `name`: only the first node of a name takes part",
+            "give this node another `name`: only the first node of a name is a member",
         )
     })
 }

@@ -309,16 +309,15 @@ impl NodeConfig {
     /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.name.is_none() {
-            return Err(ConfigError::new(
+            return Err(ConfigError::missing(
                 "name",
-                "nothing",
                 "the node's name, unique in its cell (`--name`): the host name cannot serve as one",
             ));
         }
         self.pose.validate().map_err(|error| error.within("pose"))?;
         if self.cells.is_some() && self.pose.listen.is_none() {
             let allowed = "an address that receives the vehicle's poses, beside `cells`: it moves between them by its position";
-            return Err(ConfigError::new("pose.listen", "nothing", allowed));
+            return Err(ConfigError::missing("pose.listen", allowed));
         }
         self.membership
             .validate()
@@ -533,7 +532,7 @@ mod tests {
             ("[mqtt]\nsign = true", ["`mqtt.sign`", "true", "key_file"]),
             (
                 "[tls]\nca = \"\"\ncertificate = \"a\"\nkey = \"b\"",
-                ["`tls.ca`", "nothing", "PEM"],
+                ["`tls.ca`", "missing", "PEM"],
             ),
             (
                 "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",

@@ -31,7 +31,8 @@ const LOOK_PERIOD: Duration = Duration::from_millis(200);
 /// Age from which a pose is too old to be used.
 const MAX_POSE_AGE: Duration = Duration::from_secs(2);
 
-const NO_PLACE: &str = "no pose on Earth is known: the vehicle stays in its cell, wherever it is";
+const NO_PLACE: &str =
+    "no pose on Earth is available: the vehicle stays in its cell, wherever it is";
 const PLACE_REMEDY: &str = "send poses with `latitude_deg` and `longitude_deg` to `pose.listen`";
 
 /// Longest time for a step of a node.

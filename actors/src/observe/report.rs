@@ -130,8 +130,9 @@ impl Report {
             }
         }
         for (schema, messages) in log.unknown() {
-            self.problems
-                .push(format!("{messages} messages of {schema} are not known"));
+            self.problems.push(format!(
+                "{messages} messages are of the unknown kind {schema}"
+            ));
         }
         Ok(())
     }

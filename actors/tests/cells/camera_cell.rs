@@ -1,4 +1,4 @@
-//! Cameras that do not work, and what their nodes make of it.
+//! Reactions of nodes to cameras that fail or end.
 
 use std::path::Path;
 use std::time::Duration;
@@ -37,7 +37,7 @@ async fn missing_camera_is_counted() {
     let mut newest = node.newest_map();
     timeout(PATIENCE, newest.wait_for(Option::is_some))
         .await
-        .expect("it serves itself")
+        .expect("the node produces maps without another node")
         .unwrap();
     node.stop().await;
 }
@@ -126,7 +126,8 @@ async fn two_cameras_make_one_witness() {
     node.stop().await;
 }
 
-/// The end arrives as a frame and as a status; the node logs it for either order.
+/// A source reports its end as a frame error and as a status; the trouble appears whichever arrives
+/// first.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn each_ended_source_is_trouble() {
     let photos = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");

@@ -92,7 +92,7 @@ async fn browser_follows_new_leader() {
     edge.0.kill().unwrap();
     let killed = Instant::now();
     browser
-        .until("!['edge', 'nobody', '–'].includes(document.querySelector('#leader').textContent)")
+        .until("!['edge', 'none', '–'].includes(document.querySelector('#leader').textContent)")
         .await;
     println!(
         "another leader on the page {:?} after the edge was killed",

@@ -18,7 +18,7 @@ use tokio::time::{Instant, sleep};
 use crate::fixture::{Client, DAY, Pki, client_config, node as name};
 use crate::nodes::start_cell;
 
-/// Time for which false rounds come.
+/// Duration of the attack.
 const ATTACK: Duration = Duration::from_secs(3);
 
 /// A vehicle that no honest map names.
@@ -110,7 +110,7 @@ async fn forged_standby_rounds_are_refused() {
     assert_eq!(
         unproven(gauss.counters()),
         0,
-        "those at the standby's broker are signed"
+        "rounds from the standby's broker carry valid signatures"
     );
 
     let forged = elsewhere.issue("edge", Role::Edge, DAY);

@@ -342,7 +342,7 @@ fn certified_node_waits_for_clock() {
         });
         let started = cell.now();
         cell.start(late, Fake::Year1970);
-        cell.until_unready(late, "this machine's clock says 1970-");
+        cell.until_unready(late, "this machine's clock reads 1970-");
         let waiting = cell.now() + STEP_TIME;
         cell.until("time passes", |record| {
             record.last_at().is_some_and(|at| at > waiting)

@@ -8,8 +8,8 @@ Standard input has a JSON object a line, one for each frame, frames without dete
     {"objects": [{"label": "car", "confidence": 0.93, "x_m": 0.2, "y_m": 0.1}], "seen": ["slot-0", "slot-1"]}
 
 `objects` are in the cell's frame, metres east and north; one with a `landmark` is also a vote on what is there. `seen` names
-the known locations that were in view; leave it out if the detector does not know. docs/protocol.md has all fields. When the
-input ends, the program waits for the answer to the last frame. Lines that are no frames are told of and skipped.
+the known locations that were in view; leave it out if it is unknown. docs/protocol.md has all fields. When the
+input ends, the program waits for the answer to the last frame. Lines that are no frames are reported and skipped.
 
 A cell with certificates takes the node's own, as `ecod-node pki issue NODE --role cav` makes it:
 

@@ -173,7 +173,7 @@ y_m = 0.0
 
 
 class Publisher:
-    """A plain MQTT client, which says anything."""
+    """A plain MQTT client, which publishes any payload."""
 
     def __init__(self, address: str, cell: str) -> None:
         host, _, port = address.partition(":")

@@ -9,8 +9,9 @@ use super::messages::{
 };
 use crate::object::CellObject;
 
-/// Extent of an object without a size, and height of all objects, in metres.
+/// Default length and width of an object without a size, in metres.
 const UNKNOWN_SIZE_M: f64 = 1.0;
+/// Height of every object in metres.
 pub(super) const HEIGHT_M: f64 = 1.5;
 
 /// Variance of unavailable values, as in `robot_localization`: large, and harmless to a filter.

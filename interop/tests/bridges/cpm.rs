@@ -62,7 +62,7 @@ impl Edge {
         }
     }
 
-    /// A client at the door that says and hears anything.
+    /// A client at the door that publishes and receives every topic.
     fn stranger(&self, name: &str) -> (Client, rumqttc::Connection) {
         let address: SocketAddr = self.settings.broker.parse().unwrap();
         let mut options = MqttOptions::new(name, "127.0.0.1", address.port());
@@ -70,7 +70,7 @@ impl Edge {
         Client::new(options, 64)
     }
 
-    /// Sets the cell's description, and waits until programs are told so.
+    /// Sets the cell's description, and waits until programs receive it.
     fn describe(&self, text: &str) {
         let (client, mut connection) = self.stranger("operator");
         std::thread::spawn(move || connection.iter().for_each(drop));
@@ -133,7 +133,7 @@ y_m = 0
 vacancy = { label = "EMPTY", x_m = 200, y_m = -0.1 }
 "#;
 
-/// A bus 12 m ahead of a foreign station, as that station says it.
+/// A bus 12 m ahead of another station, as that station reports it.
 fn foreign_cpm(at: Timestamp, station: u32) -> Vec<u8> {
     let bus = PerceivedObject {
         covariance_m2: Some([0.04, 0.0, 0.04]),

@@ -68,7 +68,7 @@ impl BrokerAccess {
         })
     }
 
-    /// The payload in the form that is sent on a topic.
+    /// Adds the signature envelope for a topic, if the cell signs payloads.
     pub(super) fn seal(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
         self.security.seal(topic, payload)
     }
@@ -87,7 +87,7 @@ impl BrokerAccess {
         topics: &[&str],
     ) -> Result<(AsyncClient, EventLoop), ConnectionError> {
         let trust = self.security.tls(&self.broker).map_err(unconnected)?;
-        // The parser of names takes no brackets.
+        // The parser of host names rejects brackets.
         let host = if trust.is_some() {
             self.broker.host().trim_matches(['[', ']'])
         } else {
@@ -127,7 +127,7 @@ fn unconnected(error: impl std::error::Error + Send + Sync + 'static) -> Connect
     ConnectionError::Io(std::io::Error::other(error))
 }
 
-/// Maps of a thousand vehicles go through.
+/// Large enough for a map of a thousand vehicles.
 const MAX_PACKET_BYTES: usize = 1 << 20;
 
 #[cfg(test)]

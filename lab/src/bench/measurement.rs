@@ -107,7 +107,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
     }
     let mut has_map = common.has_map.subscribe();
     let first_map = tokio::time::timeout(PATIENCE, has_map.wait_for(|has_map| *has_map)).await;
-    first_map.context("no map came: nobody leads the cell, or it has another name")??;
+    first_map.context("no map came: no node leads the cell, or the cell has another name")??;
 
     let schedule = *common
         .schedule

@@ -429,12 +429,12 @@ async fn costs(
         ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds))
     };
     let mut usages = Vec::new();
-    let mut looked = None;
+    let mut page = None;
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
         let measured = measure(aggregator.target()?, load).await?;
         if !records {
-            looked = Some(look(&mut aggregator).await?);
+            page = Some(look(&mut aggregator).await?);
         }
         aggregator.stop().await;
         usages.push(measured.aggregator.context("the aggregator ended")?);
@@ -466,9 +466,9 @@ async fn costs(
         added,
         5.0,
     );
-    let looked = looked.context("nobody looked")?;
-    let page_kb = looked.bytes as f64 / 1e3;
-    let first_picture_ms = looked.first_picture.as_secs_f64() * 1e3;
+    let page = page.context("the page was not measured")?;
+    let page_kb = page.bytes as f64 / 1e3;
+    let first_picture_ms = page.first_picture.as_secs_f64() * 1e3;
     print(&format!(
         "its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"
     ))?;

@@ -251,7 +251,7 @@ fn street_table(street: &StreetResult) -> String {
             format!("{leader} led after it, first map {gap} ms after the last one before")
         }
         (Some(leader), None) => format!("{leader} led already"),
-        (None, _) => "nobody led after it".to_owned(),
+        (None, _) => "no node led after it".to_owned(),
     };
     format!(
         "street: {} cars and people; known: found within 2 m, on average; precision: share of a node's objects that are real;\nrecall: share of the real objects that it has\n{:<8}{:^26}   {:^26}\n{:<8}{}   {}\n{}the edge was killed: {failover}\n{}",

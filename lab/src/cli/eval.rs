@@ -415,7 +415,7 @@ fn summary(name: &str, scores: &Scores) -> Vec<String> {
 fn confusion(name: &str, scores: &Scores) -> String {
     let mut cells: Vec<_> = scores.confusion.iter().collect();
     cells.sort_by_key(|cell| std::cmp::Reverse(cell.count));
-    let mut rows = vec![header(&["truth", "said", "items"])];
+    let mut rows = vec![header(&["truth", "reported", "items"])];
     rows.extend(
         cells
             .iter()
@@ -423,7 +423,7 @@ fn confusion(name: &str, scores: &Scores) -> String {
             .map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),
     );
     format!(
-        "\n{name}, truth and what was said\n{}{}",
+        "\n{name}, truth and reported labels\n{}{}",
         columns(&rows),
         rest(cells.len())
     )

@@ -220,7 +220,7 @@ async fn watch(
             let reporters = collector.reporters();
             let leader = collector
                 .leader()
-                .map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
+                .map_or_else(|| "no node".to_owned(), |leader| leader.to_string());
             bail!(
                 "after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads"
             );

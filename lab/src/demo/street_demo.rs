@@ -543,7 +543,7 @@ mod tests {
         assert_eq!(
             people,
             street.cameras.len(),
-            "each camera reads somebody: {read:?}"
+            "each camera detects an object: {read:?}"
         );
     }
 }

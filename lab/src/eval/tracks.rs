@@ -67,7 +67,7 @@ pub struct ScoredFrame {
 /// An object of the truth in one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueObject {
-    /// Its identity; small numbers, they count places in tables.
+    /// Identity: a small number, used as a table index.
     pub id: u32,
     /// Class of the object.
     pub label: Label,
@@ -78,13 +78,13 @@ pub struct TrueObject {
 /// An object of a map in one frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SaidObject {
-    /// The identity it was given; small numbers, they count places in tables.
+    /// Reported identity: a small number, used as a table index.
     pub id: u32,
-    /// The class it was given.
+    /// Reported class.
     pub label: Label,
     /// Confidence that the object exists; for average precision only the order matters.
     pub score: f64,
-    /// Probability that it exists, wherever exactly, if it is stated apart.
+    /// Probability that the object exists at any position, if stated separately from `confidence`.
     pub existence: Option<f64>,
     /// Its centre in metres.
     pub position: Point2<f64>,
@@ -124,9 +124,9 @@ pub struct TrackScores {
     /// Greatest MODA at [`AP_DISTANCES_M`] over all thresholds, all classes together, with the
     /// matches of average precision.
     pub best_moda_pct: [Option<f64>; AP_DISTANCES_M.len()],
-    /// At the threshold of the greatest F1.
+    /// Scores at the threshold with the greatest F1.
     pub at_best_f1: ThresholdScores,
-    /// Figures at [`DEFAULT_THRESHOLD`].
+    /// Scores at [`DEFAULT_THRESHOLD`].
     pub at_default: ThresholdScores,
     /// Calibration of the stated probabilities, independent of the threshold.
     pub calibration: ReliabilityBins,
@@ -160,9 +160,9 @@ pub struct ThresholdScores {
     pub idf1_pct: Option<f64>,
     /// Higher order tracking accuracy.
     pub hota_pct: Option<f64>,
-    /// Its part of detection.
+    /// Detection component of HOTA (DetA).
     pub deta_pct: Option<f64>,
-    /// Its part of association.
+    /// Association component of HOTA (AssA).
     pub assa_pct: Option<f64>,
     /// Mean similarity of the matches.
     pub loca_pct: Option<f64>,
@@ -307,8 +307,8 @@ impl TrackEvaluation {
         }
     }
 
-    /// The classes of the reported objects and of the truth, if both have some, but not one in
-    /// common.
+    /// Returns the classes of the reported objects and of the truth if both sets are non-empty and
+    /// disjoint.
     pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
         let said: BTreeSet<&Label> = self
             .maps

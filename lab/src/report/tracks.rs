@@ -32,7 +32,7 @@ pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
                 .collect::<Vec<_>>()
         };
     let mut precision = vec![
-        ["", "objects", "said"]
+        ["", "objects", "reported"]
             .map(str::to_owned)
             .into_iter()
             .chain(distances)

@@ -14,7 +14,7 @@ pub fn table(results: &[SceneResult]) -> String {
         "`paper` mode %",
         "occupied spots %",
         "best vehicle alone %",
-        "all said empty %",
+        "if all empty %",
         "recorded %",
         "spots out of view",
     ];

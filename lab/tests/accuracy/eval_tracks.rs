@@ -13,7 +13,7 @@ const TRUTH: &str = include_str!("eval_tracks/truth.json");
 const MAPS: &str = include_str!("eval_tracks/maps.jsonl");
 const EXPECTED: &str = include_str!("eval_tracks/expected.json");
 
-/// Compares all numbers of `expected` with those of the same name, and says how many there are.
+/// Compares all numbers of `expected` with the numbers of the same name, and returns how many there are.
 fn compare(path: &str, found: &Value, expected: &Value) -> usize {
     match expected {
         Value::Object(fields) => fields

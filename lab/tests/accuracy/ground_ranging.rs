@@ -139,7 +139,7 @@ impl Dice {
 }
 
 /// Errors of the places of posts with these boxes, relative to their range, and squared Mahalanobis distances.
-/// The camera is believed to be at `believed`; `noise_px` are errors of edges of a detector.
+/// The node assumes the camera at `believed`; `noise_px` are errors of edges of a detector.
 fn errors(
     found: &[BoundingBox],
     places: &[Point2<f64>],
@@ -170,7 +170,7 @@ fn errors(
         }
         let placed = projection.place(&detection, cut, None, believed).ok()?;
         let position = Vector2::new(placed.x_m, placed.y_m);
-        // Bearings tell which post it is.
+        // Bearings identify the post.
         let bearing_rad = |at: &Point2<f64>| pose.range_bearing(at).1;
         let own = bearing_rad(&Point2::from(position));
         let post = places.iter().min_by(|a, b| {

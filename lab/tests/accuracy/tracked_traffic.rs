@@ -1,4 +1,4 @@
-//! Tracking of generated traffic: better than late fusion, and the better for what detectors say beside positions.
+//! Tracking of generated traffic: better than late fusion, and better with the detectors' values beside positions.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -272,7 +272,7 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
     [ours[0], ours[1], figures(late), best]
 }
 
-/// The same, means of four scenes: a single one of 20 s is too short to tell half a point.
+/// The same, means of four scenes: a single one of 20 s is too short to distinguish half a point.
 fn means(scene: impl Fn(u64) -> TrafficRecording) -> [[f64; 6]; 4] {
     let scenes = [0, 1, 2, 3].map(|number| aligned_or_not(&scene(SEED + number)));
     [0, 1, 2, 3].map(|method| {
@@ -322,7 +322,7 @@ fn stamped_late(seed: u64) -> TrafficRecording {
     recording_by(seed, &config)
 }
 
-/// Alignment costs nothing, and nobody alone and no merging is better.
+/// Alignment costs at most half a point, and no vehicle alone and no late fusion is better.
 fn assert_best(scene: &str, [aligned, unaligned, late, alone]: [[f64; 6]; 4]) {
     let is_best = |figure: usize| {
         let others = late[figure].max(alone[figure]);

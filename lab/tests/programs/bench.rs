@@ -61,7 +61,7 @@ fn started_cell_is_measured_keeping_figures() {
         assert!(measured[bytes].as_u64().unwrap() > 1000, "{measured}");
     }
 
-    // By default it also looks for what is saturated first, and says so if nothing is.
+    // By default it also looks for what is saturated first, and prints it if nothing is.
     let found = &figures["cell"]["saturation"];
     let expected = match found["first_saturated"].as_str() {
         Some(first) => format!("saturated first: {first}"),

@@ -240,7 +240,7 @@ fn benchmark_file_errors_name_line() {
     );
 }
 
-/// Two cameras detect a person; a replay of what they said has one.
+/// Two cameras detect a person; a replay of their reports has one.
 #[test]
 fn benchmark_detections_become_reports() {
     let folder = TempDir::new().unwrap();

@@ -1,4 +1,4 @@
-//! `ecod-lab report`: what the page about a log says.
+//! `ecod-lab report`: content of the page about a log.
 
 use std::collections::BTreeMap;
 use std::fs::File;

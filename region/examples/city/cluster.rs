@@ -54,7 +54,7 @@ impl Cluster {
         for file in ["common.conf", "nats-cluster.conf"] {
             fs::copy(Path::new(DEPLOY).join(file), directory.join(file))?;
         }
-        // Without certificates: what is measured is the engine, not this machine's cryptography.
+        // No TLS: the benchmark measures the server, not cryptography.
         fs::write(
             directory.join("mqtt.conf"),
             "mqtt { listen: $REGION_MQTT }\n",
@@ -136,7 +136,7 @@ impl Cluster {
 impl Drop for Cluster {
     fn drop(&mut self) {
         for server in &mut self.servers {
-            // A stopped one ends by this signal, too.
+            // SIGKILL also ends a server that SIGSTOP has stopped.
             let _ = server.child.kill();
             // Waited for so that it leaves no zombie; its status makes no difference.
             let _ = server.child.wait();
@@ -173,7 +173,8 @@ fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow
         .context("nats-server cannot be started; `make city` installs it")
 }
 
-/// A free port below those of outgoing connections, one of which could take it while its server is away.
+/// A free port below the ephemeral range, so that no outgoing connection takes it while the server
+/// is down.
 pub(crate) fn free_address() -> anyhow::Result<SocketAddr> {
     static GIVEN: AtomicUsize = AtomicUsize::new(0);
     let start = std::process::id() as usize * 97;

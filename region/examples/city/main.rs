@@ -2,8 +2,7 @@
 //!
 //! `make city` runs it. Each simulated cell has a connection and an account of its own, as a cell's leader has. Each
 //! real one is an `ecod-node` with an uplink, and a vehicle that reports to it. Two subscribers on two servers read
-//! half of the
-//! town each. Vehicles pass through some cells, which tell of them whatever happens.
+//! half of the town each. Vehicles pass through some cells, which report them in every phase.
 
 mod cluster;
 mod fleet;
@@ -89,7 +88,7 @@ fn main() -> anyhow::Result<()> {
     );
     city.until_whole("from nothing", clock::now())?;
     city.steady(arguments.seconds);
-    // While all log in at once, a backlog of seconds cannot be told from a clock that is as much behind.
+    // While all log in at once, a backlog of seconds looks like a clock that is equally late.
     let at_start = city.take_too_old();
     println!(
         "  maps that counted though they were too old, while all logged in for the first time: {}",
@@ -266,7 +265,7 @@ impl City {
         }
     }
 
-    /// Cuts five real cells off, and tells what the uplink cost them.
+    /// Cuts five real cells off, and prints what the uplink cost them.
     fn cut_off(&mut self) {
         let pids: Vec<_> = self.real.pids().into_iter().take(5).collect();
         let mean = || {

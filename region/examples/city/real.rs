@@ -68,7 +68,7 @@ impl RealCells {
             fs::write(&file, config)?;
             let log = fs::File::create(directory.join(format!("{cell}.log")))?;
             let mut command = Command::new(node);
-            // The node is what its file says, whatever the environment says to others.
+            // Only the file configures the node, not the environment of the benchmark.
             for (key, _) in
                 std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
             {
@@ -100,7 +100,7 @@ impl RealCells {
         self.nodes.iter().map(Child::id).collect()
     }
 
-    /// Nothing goes over the lines of so many cells any more, and nobody tells them.
+    /// Cuts the lines of the first `count` cells without closing their connections.
     pub(crate) fn cut(&self, count: usize) {
         self.lines.iter().take(count).for_each(|line| {
             line.send_replace(false);

@@ -7,7 +7,7 @@ const PERIOD_MS = 1000;
 const MOVED_MS = 150;
 const PATIENCE_MS = 5000;
 
-// Tells this page from others of the same host: each looks at one place.
+// Distinguishes this page from others of the same host: each shows one place.
 const VIEWER = Math.random().toString(36).slice(2);
 
 let latest = null;

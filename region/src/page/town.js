@@ -139,9 +139,10 @@ function drawCells(cells, names, all) {
     const [cx, cy] = places.get(key(cell));
     sign.page = cell.page;
     set(sign, { class: `cell ${cell.state}${cell.troubles.length ? " troubled" : ""}`, cx, cy });
+    const state = cell.state === "told" ? "leading" : cell.state;
     const age = cell.age_s === null ? "" : `, map ${span(cell.age_s)} old`;
     const page = cell.page ? `, page at ${cell.page}` : "";
-    text(sign.firstChild, `${cell.cell}: ${cell.state}, led by ${cell.leader ?? "nobody"}${age}${page}`);
+    text(sign.firstChild, `${cell.cell}: ${state}, ${cell.leader ? `led by ${cell.leader}` : "no leader"}${age}${page}`);
   });
   keyed(names, named, key, () => svg("text"), (label, cell) => {
     const [cx, cy] = places.get(key(cell));

@@ -228,7 +228,7 @@ impl Broker {
         .collect()
     }
 
-    /// A reader of the whole region that tells of each message.
+    /// A reader of the whole region that reports each message.
     pub(crate) fn read(&self, seen: impl FnMut(&Reading<'_>) + Send + 'static) -> Arc<RegionState> {
         let login = self.login("region.reader");
         let state = Arc::new(RegionState::default());

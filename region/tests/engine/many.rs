@@ -182,7 +182,7 @@ fn map(cell: &NodeName, origin: GeographicOrigin, round: u64) -> Vec<u8> {
     encode(&message, Encoding::Compact)
 }
 
-/// Publishes all statuses, and maps at 2 Hz until told to stop.
+/// Publishes all statuses, and maps at 2 Hz until stopped.
 async fn publish(client: AsyncClient, stop: Arc<AtomicBool>) {
     for number in 0..SIDE * SIDE {
         let (cell, origin) = cell(number % SIDE, number / SIDE);

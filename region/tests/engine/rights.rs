@@ -74,7 +74,7 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         arrived.lock().unwrap().contains(&statuses[1])
     })
     .await;
-    // A retained forgery would come to whoever subscribes later.
+    // A client that subscribes later would receive a retained forgery.
     let later = listen(broker).await;
     lot.publish_map(2, 1);
     until("the second reader hears", || {

@@ -136,7 +136,7 @@ pub struct LifeSign {
 /// ```text
 /// seeker    -> all         Ask
 /// follower  -> leader      Ask                where its last sign of life is old
-/// follower  -> seeker      LeaderEvidence     "I heard it 12 ms ago", with its last sign of life
+/// follower  -> seeker      LeaderEvidence     "received 12 ms ago", with its last sign of life
 /// claimant  -> all         Beat      epoch + 1, after = the epoch it succeeds
 /// ```
 ///

@@ -8,7 +8,7 @@ use super::level_sight::LevelSight;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Estimate {
     pub(super) distance_m: f64,
-    /// Changes in metres.
+    /// Change of the distance in metres for one standard deviation of each error source.
     pub(super) errors: Errors,
 }
 
@@ -42,7 +42,7 @@ impl Estimate {
     }
 
     /// The line of sight at this distance, in the direction of `sight`; `middle_m` is the standard
-    /// deviation of the middle of the box from the middle of the object.
+    /// deviation in metres between the centres of box and object.
     pub(super) fn along(&self, sight: &LevelSight, middle_m: f64) -> LineOfSight {
         LineOfSight {
             bearing_rad: sight.bearing_rad,

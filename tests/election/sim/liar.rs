@@ -47,7 +47,7 @@ fn false_claim_takes_no_lead() {
             for lie in 0..1000 {
                 tell_lies(world, liar, leader, FORGED + lie);
                 world.run_for(10 * MS);
-                ensure(world.nodes[leader].leads(), "the leader gave way")?;
+                ensure(world.nodes[leader].leads(), "the leader stepped down")?;
                 for (index, node) in world.alive().filter(|(index, _)| *index != liar) {
                     let follows = node.leader() == Some(&world.nodes[leader].name);
                     ensure(
@@ -81,7 +81,7 @@ fn vouched_hung_leader_is_replaced() {
             let candidates: Vec<usize> = (0..world.nodes.len())
                 .filter(|node| is_candidate(*node))
                 .collect();
-            // Of two candidates, one is honest. Large cells take long to lie to.
+            // Needs a second, honest candidate; large cells take too long.
             let [liar, _, ..] = candidates[..] else {
                 return Ok(());
             };
@@ -106,7 +106,7 @@ fn vouched_hung_leader_is_replaced() {
             let lie = LIES.iter().find(|lie| lie.message == "vouch").unwrap();
             let mut seq = FORGED;
             while !has_taken_over(world) {
-                // Questions have small numbers.
+                // Query numbers are small.
                 for _ in 0..100 {
                     seq += 1;
                     tell(world, lie, liar, leader, seq, &life);
@@ -434,7 +434,7 @@ fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
         };
         let from = world.now;
         lie_for(world, 3 * SECOND);
-        ensure(world.nodes[leader].leads(), "the leader gave way")?;
+        ensure(world.nodes[leader].leads(), "the leader stepped down")?;
         let changes = world.led.len() - before;
         longest_gap[0] = longest_gap_of(world, &[liar, leader], from)?;
         // A candidate that claims the lead of a hung leader gets it.
@@ -465,7 +465,7 @@ fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
     outcome
 }
 
-/// The longest time without a map since `from` at all nodes but these.
+/// The longest time in µs without a map since `from`, at all nodes except these.
 fn longest_gap_of(world: &World, but: &[usize], from: u64) -> Result<u64, String> {
     let mut longest = 0;
     for (_, node) in world.alive().filter(|(index, _)| !but.contains(index)) {

@@ -388,7 +388,7 @@ fn one_sided_landmarks_are_reported() {
     take(&mut with, report(1), now, Some("slot-0"));
     assert_eq!(troubles(&with), []);
     take(&mut with, report(2), now, Some("slot-9"));
-    let cause = "names the location “slot-9”, which this node does not know";
+    let cause = "names the location “slot-9”, which this node does not have";
     let unknown = [(
         Some("euclid".to_owned()),
         "unknown_location".to_owned(),

@@ -361,8 +361,8 @@ impl ElectionDriver {
                 if self.overreached.insert(from.clone()) {
                     tracing::warn!(
                         %from, %role, priority, allowed_role = %rights.role, allowed_priority = rights.priority,
-                        "a node declares more than its certificate allows and counts as what that says; issue it a \
-                         certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
+                        "a node declares more than its certificate allows; the role and priority of the certificate \
+                         apply; issue it a certificate by `ecod-node pki issue`, or lower its `role` or `election.priority`"
                     );
                 }
             }

@@ -27,7 +27,7 @@ struct DiskAnswer {
     is_saved: bool,
 }
 
-/// Fate of a term, should the node restart.
+/// Whether a term survives a restart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TermState {
     /// It is on disk.
@@ -50,7 +50,7 @@ pub fn saved_term(file: Option<&StateFile>) -> u64 {
     match file.load(|_| true).unwrap_or(0) {
         term if term <= MAX_SAVED_TERM => term,
         _ => {
-            file.set_aside("no cell has had so many leaderships: the term was forged");
+            file.set_aside("the term exceeds the plausible maximum: it was forged");
             0
         }
     }

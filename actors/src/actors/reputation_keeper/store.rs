@@ -42,8 +42,8 @@ impl ReputationStore {
     }
 
     /// Loads saved evidence, within the bounds for other nodes' evidence. If evidence is signed,
-    /// `signer` verifies it. `date` is the current time; an unset clock is not used for
-    /// checks.
+    /// `signer` verifies it. `date` is the current time; without a set clock, checks against
+    /// it are skipped.
     fn adopt(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
         let Saved {
             entries,
@@ -107,7 +107,7 @@ impl ReputationStore {
         if dropped > 0 {
             tracing::warn!(
                 dropped,
-                "saved evidence not used: not signed, of a revoked node, or more than there can be"
+                "saved evidence ignored: unsigned, from a revoked node, or more votes than possible"
             );
         }
         counts
@@ -251,7 +251,7 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
     }
     let Some(file) = &arguments.file else {
         tracing::warn!(
-            "no `state_dir`: reputations, and the terms in which this node has led, end with it"
+            "`state_dir` is not set: reputations and terms are lost when the node stops"
         );
         return;
     };

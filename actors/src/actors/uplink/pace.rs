@@ -10,7 +10,7 @@ const NEIGHBOUR_TIMEOUT: Duration = Duration::from_secs(5);
 /// Factor on the rate while a neighbour is present.
 const NEIGHBOUR_FACTOR: f64 = 5.0;
 
-/// Share of the interval by which a map may be early. Rounds close a little before or after due
+/// Fraction of the interval by which a map may be early, because rounds do not close exactly at due
 /// times.
 const MAX_EARLY_SHARE: f64 = 0.25;
 
@@ -89,11 +89,11 @@ mod tests {
         let beside = count(&mut pace, 25_000);
         assert!(
             (54..=60).contains(&beside),
-            "{beside}: for five seconds all of ten a second, then two a second"
+            "{beside}: ten per second for five seconds, then two"
         );
         assert!(
             (19..=21).contains(&count(&mut pace, 35_000)),
-            "without it as before"
+            "back to two per second after the neighbour's timeout"
         );
         assert_eq!(count(&mut MapPace::new(0.5), 5_000), 6);
     }

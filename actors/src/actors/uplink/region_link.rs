@@ -19,8 +19,8 @@ use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink
 use crate::transport::mqtt::packet_sink::PacketSink;
 use crate::transport::mqtt::{MqttConfig, Security};
 
-/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node
-/// that stops waits for it.
+/// Maximum time for sending DISCONNECT; if exceeded, the broker publishes the last will. A stopping
+/// node waits for it.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Materials of a link to the region's broker.
@@ -134,7 +134,7 @@ impl RegionLink {
                 state
             }
             LinkChange::Answered if self.link.state == LinkState::Stalled => LinkState::Up,
-            // Other runs and last wills come as statuses.
+            // Name conflicts and last wills are handled as status messages.
             LinkChange::Answered | LinkChange::DeclaredOffline | LinkChange::Namesake(_) => {
                 return false;
             }
@@ -166,7 +166,7 @@ impl RegionLink {
         } else {
             Event::RegionWithheld
         });
-        // This cell's own map comes back, like the maps of the cells around.
+        // The broker also returns this cell's own map.
         if self.link.state == LinkState::Up && self.link.misses_echo(now) {
             self.link.state = LinkState::Stalled;
             tracing::info!(broker = %self.link.broker, state = %LinkState::Stalled, "uplink changed");

@@ -186,7 +186,7 @@ pub enum OnnxError {
     },
     /// The outputs fit no family, or not the configured one.
     #[error(
-        "model {path:?} has outputs {outputs} for an image of {size}, which are not those of {family}; \
+        "model {path:?} has outputs {outputs} for an image of {size}, which do not match {family}; \
          docs/cameras.md lists the shapes"
     )]
     UnknownOutputs {
@@ -522,7 +522,7 @@ impl Detect for OnnxDetector {
     }
 }
 
-/// A task of Ultralytics' models in words, unless it is to find boxes.
+/// Describes the task of an Ultralytics model; `None` for box detection.
 fn other_task(task: &str) -> Option<String> {
     match task {
         "detect" => None,

@@ -79,7 +79,7 @@ impl<'a> LogReplay<'a> {
             }
             for (schema, messages) in log.unknown() {
                 eprintln!(
-                    "{}: {messages} messages of {schema:?} are not known and skipped",
+                    "{}: {messages} messages of the unknown kind {schema:?} are skipped",
                     file.display()
                 );
             }

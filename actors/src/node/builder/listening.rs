@@ -83,10 +83,10 @@ impl NodeBuilder {
                 tracing::info!("broker for this machine only: no certificates are configured");
             }
             (None, false) => {
-                tracing::warn!(%listen, "broker for anyone: no certificates are configured");
+                tracing::warn!(%listen, "broker for every client: no certificates are configured");
             }
             (Some(_), _) => {
-                tracing::info!(%listen, "broker for whoever has a certificate of the cell");
+                tracing::info!(%listen, "broker for clients with a certificate of the cell");
             }
         }
         let topics = Topics::new(&self.config.cell);

@@ -54,9 +54,12 @@ impl NodeConfig {
                 .as_ref()
                 .filter(|_| earlier.clone().all(|other| other.name != camera.name))
             else {
-                let name = camera.name.as_deref().unwrap_or("nothing");
-                let allowed = "a name of its own, such as \"rear\": its reports are those of that part of the vehicle";
-                return Err(within(ConfigError::new("name", name, allowed)));
+                let allowed =
+                    "unique, such as \"rear\": the camera reports as that part of the vehicle";
+                return Err(within(camera.name.as_ref().map_or_else(
+                    || ConfigError::missing("name", allowed),
+                    |name| ConfigError::new("name", name, allowed),
+                )));
             };
             if self
                 .name

@@ -81,7 +81,7 @@ impl CellEntry {
         if self.revocation_list.is_some() && self.ca.is_none() {
             return Err(ConfigError::new(
                 "revocation_list",
-                "set",
+                "a file",
                 "set together with `ca`",
             ));
         }

@@ -80,7 +80,7 @@ pub enum DescriptionError {
     OutOfRange(ConfigError),
     /// The node's own configuration has a different value.
     #[error(
-        "configuration key `{key}`: this node's own configuration says {own}, the description of the cell says \
+        "configuration key `{key}`: this node's own configuration has {own}, the description of the cell has \
          {described}; remove the key from the node's configuration, or change the description by `ecod-node cell set`"
     )]
     Contradicts {

@@ -2,7 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 
-use ecod::config::{ConfigError, check_range};
+use ecod::config::{ConfigError, ValueFault, check_range};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -73,11 +73,13 @@ impl DashboardConfig {
                 .map_err(|error| error.within("floor_plan"))?;
         }
         match (&self.token, self.listen) {
-            (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => Err(ConfigError::new(
-                "token",
-                "a shorter text",
-                format!("at least {MIN_TOKEN_BYTES} characters"),
-            )),
+            (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
+                Err(ConfigError::with_fault(
+                    "token",
+                    ValueFault::TooShort,
+                    format!("at least {MIN_TOKEN_BYTES} characters"),
+                ))
+            }
             (Some(token), _)
                 if !token
                     .reveal()
@@ -93,9 +95,8 @@ impl DashboardConfig {
                 ))
             }
             (None, Some(address)) if self.enabled && !address.ip().is_loopback() => {
-                Err(ConfigError::new(
+                Err(ConfigError::missing(
                     "token",
-                    "nothing",
                     format!("a secret, as other machines reach {address}"),
                 ))
             }

@@ -262,7 +262,7 @@ mod tests {
         ] {
             let error = plan(path, good).load().unwrap_err();
             assert!(
-                error.key == "image" && error.value.contains(cause),
+                error.key == "image" && error.fault.to_string().contains(cause),
                 "{error}"
             );
         }

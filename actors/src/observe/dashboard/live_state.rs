@@ -479,7 +479,7 @@ mod tests {
             kind: kind.into(),
             about: about.map(str::to_owned),
             cause: cause.into(),
-            remedy: "mend it".into(),
+            remedy: "correct it".into(),
         };
         let say = |node: &str, state, troubles| {
             let starting = NodeStatus::starting(

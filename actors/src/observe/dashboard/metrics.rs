@@ -205,7 +205,7 @@ fn election(registry: &mut Registry, monitor: &NodeMonitor) {
     gauge(
         registry,
         "election_epoch",
-        "Highest term of leadership known",
+        "Highest term of leadership that the node has received or used",
         term,
     );
     let failovers = Counter::<u64>::default();

@@ -231,6 +231,8 @@ impl NodeMonitor {
         }
     }
 
+    /// Handles a change of the node's leadership: the history gets the new position and epoch, so that
+    /// the page shows failovers and gaps.
     fn on_leadership(&self) {
         let leadership = self.sources.vitals.leadership.borrow().clone();
         self.observed()
@@ -238,6 +240,8 @@ impl NodeMonitor {
             .add_leadership(&leadership, clock::now());
     }
 
+    /// Handles an accepted map: adds its latency to the metrics and its round to the history. Capture
+    /// times are converted from the cell's time to the node's clock.
     fn on_map(&self) {
         let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else {
             return;

@@ -126,7 +126,7 @@ impl LeadershipChange {
     pub(crate) fn in_words(&self) -> String {
         match (self.position.as_str(), &self.epoch) {
             ("leading", Some(epoch)) => format!("leads in term {}", epoch.term),
-            ("seeking", _) => "knows no leader".into(),
+            ("seeking", _) => "has no leader".into(),
             (_, Some(epoch)) => format!("follows {} in term {}", epoch.leader, epoch.term),
             (position, None) => position.into(),
         }

@@ -71,7 +71,7 @@ pub enum LogError {
         source: McapError,
     },
     /// A later version of the program wrote it.
-    #[error("{path} has version {found} of the log, this program knows {known}", known = LogIdentity::VERSION)]
+    #[error("{path} has version {found} of the log, this program reads {known}", known = LogIdentity::VERSION)]
     Newer {
         /// Path of the file.
         path: PathBuf,

@@ -270,7 +270,7 @@ fn reputations(report: &Report) -> String {
         + &table(&["vehicle", "last"], &rows);
     section(
         "Reputations",
-        "How much each vehicle's word counts, from 0 to 1: it follows from how often the others agreed with it.",
+        "How much each vehicle's reports count, from 0 to 1: this follows from how often the others agreed with the vehicle.",
         &text,
     )
 }

@@ -442,7 +442,7 @@ mod tests {
         }
         assert!(
             permissions.allows(&anyone(), "elsewhere", false, 0),
-            "without certificates anybody may say anything"
+            "without certificates every client may publish everything"
         );
     }
 

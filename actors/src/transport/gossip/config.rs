@@ -4,7 +4,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ecod::config::{ConfigError, check_range};
+use ecod::config::{ConfigError, ValueFault, check_range};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -122,9 +122,9 @@ impl MembershipConfig {
             .as_ref()
             .is_some_and(|key| key.reveal().trim().len() < MIN_KEY_BYTES)
         {
-            return Err(ConfigError::new(
+            return Err(ConfigError::with_fault(
                 "key",
-                "a shorter text",
+                ValueFault::TooShort,
                 format!("at least {MIN_KEY_BYTES} characters"),
             ));
         }
@@ -132,9 +132,9 @@ impl MembershipConfig {
             .advertise
             .is_some_and(|address| address.ip().is_unspecified() || address.port() == 0)
         {
-            return Err(ConfigError::new(
+            return Err(ConfigError::with_fault(
                 "advertise",
-                "an open address",
+                ValueFault::Unspecified,
                 "an address and port that others can reach",
             ));
         }

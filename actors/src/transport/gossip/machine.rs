@@ -667,6 +667,8 @@ impl GossipMachine {
             .map_or(self.hello_at, |due| due.min(self.hello_at))
     }
 
+    /// Begins each input: advances the node's awake clock to `now` and returns its time. Time beyond
+    /// the next due timer plus [`STALL`] does not count, so a stalled node declares no peer down.
     fn advance(&mut self, now: Timestamp) -> Timestamp {
         self.clock.advance(now, self.due())
     }

@@ -149,7 +149,7 @@ impl Link {
             && let Some(task) = self.task.take()
             && tokio::time::timeout(patience, task).await.is_err()
         {
-            tracing::debug!(broker = %self.broker, "broker did not take the farewell");
+            tracing::debug!(broker = %self.broker, "broker did not accept the leave messages");
         }
     }
 }

@@ -162,7 +162,7 @@ impl Security {
             let begins = date(begins);
             let expires = date(expires);
             format!(
-                "this machine's clock says {wall}, and the node's certificate is valid from {begins} to {expires}: set the \
+                "this machine's clock reads {wall}, and the node's certificate is valid from {begins} to {expires}: set the \
                  clock, such as by `timedatectl set-ntp true`, or give it a new certificate by `ecod-node pki issue`"
             )
         })

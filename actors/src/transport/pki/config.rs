@@ -64,19 +64,17 @@ impl TlsConfig {
             .chain(city_list)
         {
             if path.as_os_str().is_empty() {
-                return Err(ConfigError::new(key, "nothing", "the path of a PEM file"));
+                return Err(ConfigError::missing(key, "the path of a PEM file"));
             }
         }
         // If there is any list, certificates of a CA without a list are refused.
         match (list, city_list) {
-            (None, Some(_)) => Err(ConfigError::new(
+            (None, Some(_)) => Err(ConfigError::missing(
                 "revocation_list",
-                "nothing",
                 "set together with `city.revocation_list`",
             )),
-            (Some(_), None) if city.is_some() => Err(ConfigError::new(
+            (Some(_), None) if city.is_some() => Err(ConfigError::missing(
                 "city.revocation_list",
-                "nothing",
                 "set together with `revocation_list`",
             )),
             _ => Ok(()),

@@ -194,7 +194,7 @@ def corners(g, features):
 
 
 def rtdetr_list(seed):
-    """The export of RT-DETR's authors: boxes in pixels of the size that the second input says."""
+    """The export of RT-DETR's authors: boxes in pixels of the size in the second input."""
     g = Graph(seed)
     features = g.features(16, 4 + len(NAMES), 3)
     scores = g("Sigmoid", g.columns(features, 4, 4 + len(NAMES)))

@@ -107,7 +107,7 @@ fn readable_log_part_is_used() {
         "{code} {lines} {said}"
     );
     assert!(
-        said.contains("1 messages of \"ecod.Tea\" are not known"),
+        said.contains("1 messages of the unknown kind \"ecod.Tea\" are skipped"),
         "{said}"
     );
 
@@ -154,7 +154,7 @@ fn unreadable_configuration_requires_given_one() {
         (
             "newer.mcap",
             log(7),
-            "newer.mcap has version 7 of the log, this program knows 1",
+            "newer.mcap has version 7 of the log, this program reads 1",
         ),
         (
             "unknown.mcap",

@@ -118,8 +118,8 @@ class Cell:
     def description(self, timeout: float = 10.0) -> CellDescription:
         """The settings that all nodes of the cell share, as they are now; version 0 if there are none.
 
-        A node always tells the programs beside it. Other brokers have nothing in a cell without a description: raises
-        `Silent` when nothing comes within `timeout` seconds, and `Refused` when the broker refuses.
+        A node always sends its description to the programs beside it. Other brokers send none in a cell without a
+        description: raises `Silent` when nothing comes within `timeout` seconds, and `Refused` when the broker refuses.
         """
         for description in self._read(self._descriptions, timeout):
             return description
@@ -171,7 +171,7 @@ class Cell:
 
         A box that gives no position, such as one above the horizon, is left out; the node counts it as `not_placed` and
         states the reason on `nodes/<node>/clients`. The rest is as in `report`. Brokers other than those of nodes do not
-        place boxes: raises `Refused` where they answer that nobody receives them.
+        place boxes: raises `Refused` if the broker answers that no program receives them.
         """
         listed: list[PixelBox] = checked(list[PixelBox], _listed("boxes", boxes), "boxes")
         for index, box in enumerate(listed):
@@ -294,7 +294,7 @@ class Cell:
             return is_sent
 
     def _take(self, topic: str, payload: bytes) -> None:
-        """Takes a message from the broker: the newest of its kind counts, an unusable one is counted and told of once."""
+        """Takes a message from the broker: the newest of its kind counts, an unusable one is counted and logged once."""
         head, _, node = topic[len(self._root) :].partition("/")
         for stream in (self._maps, self._verdicts, self._reputations, self._statuses, self._descriptions):
             if stream.topic.partition("/")[0] == head:

@@ -250,7 +250,7 @@ def _default(field: Any) -> Any:
 
 
 def _at(place: str, inner: Reader, value: Any, is_compact: bool) -> Any:
-    """Reads a part; a flaw tells its place."""
+    """Reads a part; an error names its place."""
     try:
         return inner(value, is_compact)
     except Flaw as flaw:

@@ -1,4 +1,4 @@
-"""Errors that a program can act on. Each message says what failed, where, and the remedy."""
+"""Errors that a program can act on. Each message states what failed, where, and the remedy."""
 
 
 class EcodError(Exception):

@@ -432,7 +432,7 @@ class CellDescription:
 
 @dataclass(frozen=True)
 class DescriptionStatus:
-    """A node's description of its cell; `problem` says why the node does not use it."""
+    """A node's description of its cell; `problem` is the reason why the node does not use it."""
 
     version: Count
     hash: Hash

@@ -31,7 +31,7 @@ impl StandingCamera {
         };
         if lens(camera)?.is_any_shape {
             bail!(
-                "keys `camera.optics.width_px` and `height_px` are missing: files of boxes do not say how large the image is"
+                "keys `camera.optics.width_px` and `height_px` are missing: files of boxes do not state the size of the image"
             );
         }
         let pose = standing_pose(&config)?

@@ -257,7 +257,7 @@ fn matching_maximises_sum() {
         pair(1, 0, 0.8), // 0.8 + 0.8 beats 0.9
         pair(5, 9, 0.1),
         pair(6, 9, 0.4),
-        pair(7, 9, 0.3), // more true than said
+        pair(7, 9, 0.3), // more true than reported
         pair(8, 20, 0.0),
     ];
     let mut chosen: Vec<_> = matching::best(&pairs)

@@ -20,10 +20,10 @@ fn lens() -> Lens {
 }
 
 const SIDE_MM: f64 = 400.0;
-/// Pixels of the drawing to a module or square.
+/// Pixels per module or square of the drawing.
 const DRAWN_PX: i32 = 24;
 
-/// Dark squares on white, with a rim of four.
+/// Dark squares on white, with a white border of four squares.
 fn flat(side: i32, is_dark: impl Fn(i32, i32) -> bool) -> Mat {
     let whole = (side + 8) * DRAWN_PX;
     let mut image =

@@ -110,7 +110,7 @@ fn stated_family_must_fit_model() {
         ..config("yolov8")
     });
     assert!(
-        error.contains("output0 [1, 7, 84] for an image of 64x64, which are not those of yolox"),
+        error.contains("output0 [1, 7, 84] for an image of 64x64, which do not match yolox"),
         "{error}"
     );
 }

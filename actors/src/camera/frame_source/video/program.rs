@@ -41,7 +41,7 @@ fn serve() -> anyhow::Result<()> {
     let mut request = String::new();
     io::stdin().lock().read_line(&mut request)?;
     let VideoRequest { source, timeout } = serde_json::from_str(&request)
-        .context("ecod-node starts this program, and tells it on standard input what to open")?;
+        .context("ecod-node starts this program and sends the source to open on standard input")?;
     thread::spawn(end_with_input);
     let mut video = match Video::open(&source, timeout) {
         Ok(video) => video,

@@ -11,7 +11,7 @@ export class CameraView {
   #source = null;
   #visible = false;
   #shows = false;
-  /// Names of the cameras, the first of which may have none, and which of them is looked at.
+  /// Names of the cameras, the first of which may have none, and which of them is shown.
   #names = [];
   #chosen = null;
   #boxes = [];

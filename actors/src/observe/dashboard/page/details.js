@@ -20,7 +20,7 @@ export function ellipse([xx, xy, yy]) {
 /// Nodes that see an object, in words.
 export const sightings = ({ contributors, vehicle }) => witnesses(contributors.map((name) => (name === vehicle ? "itself" : name)));
 
-const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${[...names].sort().join(", ")}`);
+const witnesses = (names) => (names.length === 0 ? "by no vehicle at present" : names.length === 1 ? `only by ${names[0]}` : `by ${[...names].sort().join(", ")}`);
 
 /// Shows details in a corner of the map away from the symbol at `at` in pixels; null hides them.
 export function showDetails(named, isKept, at, box) {

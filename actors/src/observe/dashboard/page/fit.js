@@ -1,4 +1,4 @@
-// Fit of the map: bounds that few far things do not rule, and signs at the border for what lies outside.
+// Fit of the map: bounds that ignore a few distant objects, and signs at the border for what lies outside.
 
 const MARGIN_PX = 46;
 /// Maximum pixels per metre without zoom.

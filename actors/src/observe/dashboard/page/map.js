@@ -191,7 +191,7 @@ export class BirdsEye {
     });
   }
 
-  /// Class of a symbol, which says when it is pointed at.
+  /// Class of a symbol, which reports when it is pointed at.
   #light(symbol, name) {
     symbol.onpointerenter = symbol.onfocus = () => this.onLight(name);
     symbol.onpointerleave = symbol.onblur = () => this.onLight(null);

@@ -59,7 +59,7 @@ export class MountPoints {
     return this.#isOpen ? this.#points.filter((point) => point.x_m !== undefined && point.y_m !== undefined) : [];
   }
 
-  /// Takes the size of the camera's frames, where they tell it.
+  /// Applies the size of the camera's frames, if they contain it.
   take({ width_px, height_px }) {
     const isNew = width_px !== this.#size?.[0] || height_px !== this.#size?.[1];
     this.#size = width_px && height_px ? [width_px, height_px] : null;

@@ -16,7 +16,7 @@ function fill(name, items, key, cells) {
 
 export function tiles({ leadership, map, verdicts }, now, perSecond) {
   const { leader, epoch, since_us, standby, position, failovers } = leadership;
-  text(byId("leader"), leader ?? "nobody");
+  text(byId("leader"), leader ?? "none");
   const mine = { leading: ", this node", standing_by: "", following: "", seeking: "" }[position];
   text(byId("leader-more"), leader ? `term ${epoch}${mine}, for ${since_us ? span((now - since_us) / 1e6) : "–"}` : "no leader known");
   text(byId("standby"), standby ?? "–");

@@ -1,24 +1,24 @@
 // Explanations of terms, shown at what is marked with `data-term` when it is pointed at or has the focus.
 
 const TERMS = {
-  leader: "The node that joins the reports of all vehicles into one map, and sends it to everybody.",
+  leader: "The node that joins the reports of all vehicles into one map, and sends it to all nodes.",
   standby: "The node that takes over at once when the leader fails.",
   epoch: "Number of a leadership, also called epoch. It grows with each change of leader, so that messages of an earlier one are refused.",
   round: "The leader makes one map after another. This is the number of the newest one, its round.",
   latency: "Time from the oldest picture that went into a map until that map arrived here.",
-  place: "A known location of the cell, such as a parking spot, that vehicles look at.",
+  place: "A known location of the cell, such as a parking spot, that vehicles observe.",
   verdict: "The label of a place on which the vehicles agree, after their votes were weighted.",
   margin: "Lead of the label over the next best one, in weighted votes. It is close below a quarter of the label's votes.",
-  reputation: "How much a vehicle's word counts, from 0 to 1. It rises where others agree, and falls where they contradict.",
+  reputation: "How much a vehicle's reports count, from 0 to 1. It rises where others agree, and falls where they contradict.",
   confidence: "Probability that the object is there, and within 1.5 m of its position. For a place: how sure its label is.",
   existence: "Probability that the object exists and is still there, wherever exactly it stands.",
   witnesses: "The vehicles whose detections of the last seconds went into the object or place.",
   spread: "Half length and half width of the ellipse that holds the true position with a probability of 95 %.",
   gap: "Time from the last map of the leader before to the first map of this one.",
-  trouble: "Something that is wrong at present. It disappears from the list when it is mended.",
+  trouble: "Something that is wrong at present. It disappears from the list when its cause is removed.",
 };
 
-/// Makes terms tell their meaning, also to screen readers.
+/// Shows the meaning of terms, also to screen readers.
 export function explainTerms() {
   const tip = Object.assign(document.createElement("div"), { id: "tip", hidden: true });
   tip.setAttribute("aria-hidden", "true");

@@ -14,7 +14,7 @@ const SIGNS = { joined: "▲", gap: "…", lost: "▼", took_over: "◆", troubl
 const GRAVITY = Object.keys(SIGNS);
 
 export class Timeline {
-  /// Time in microseconds that is looked at; null for now.
+  /// Time in microseconds that the page shows; null for now.
   cursor = null;
   #shown = { reigns: [], events: [], frames: [], from: 0, until: 1 };
 
