@@ -221,6 +221,6 @@ impl Neighbours {
             .retain(|_, map| now.since(map.fused_at) <= MAX_AGE);
         self.filter.forget_silent(now);
         let filter = &self.filter;
-        self.losses.retain(|cell, _| filter.knows(cell));
+        self.losses.retain(|cell, _| filter.has_cell(cell));
     }
 }

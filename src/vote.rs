@@ -184,7 +184,7 @@ impl Vote {
 
     /// True if a location of this id is listed; `None` without a list, where reports name the
     /// locations.
-    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+    pub fn has_location(&self, id: &LandmarkId) -> Option<bool> {
         (!self.open).then(|| self.landmarks.contains_key(id))
     }
 

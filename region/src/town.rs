@@ -123,7 +123,7 @@ pub enum CellState {
     Live,
     /// Its status claims a leader, but its maps are not read, or not for long enough for a
     /// conclusion.
-    Told,
+    Claimed,
     /// Its status claims a leader, but no map arrives although one is due.
     Silent,
     /// Its status is offline.
@@ -132,13 +132,13 @@ pub enum CellState {
 
 impl CellState {
     /// All states in order of declaration.
-    pub const ALL: [Self; 4] = [Self::Live, Self::Told, Self::Silent, Self::Offline];
+    pub const ALL: [Self; 4] = [Self::Live, Self::Claimed, Self::Silent, Self::Offline];
 
     /// The state in metrics and on the page.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Live => "live",
-            Self::Told => "told",
+            Self::Claimed => "told",
             Self::Silent => "silent",
             Self::Offline => "offline",
         }
@@ -348,7 +348,7 @@ impl RegionCell {
             {
                 CellState::Silent
             }
-            _ => CellState::Told,
+            _ => CellState::Claimed,
         }
     }
 }

@@ -278,7 +278,7 @@ impl LedgerResync {
             .is_none_or(|leader| *leader == share.node);
         let leader = share
             .epoch
-            .filter(|term| is_leader && leadership.knows_term(*term));
+            .filter(|term| is_leader && leadership.has_term(*term));
         self.receive(
             leader.map(|term| Epoch::new(term, share.node.clone())),
             ledger,
@@ -330,9 +330,9 @@ impl LedgerResync {
                 // Only this node has its current counts.
                 return false;
             }
-            let reason = if !leadership.knows_term(lane.term) {
+            let reason = if !leadership.has_term(lane.term) {
                 RejectReason::UnknownTerm
-            } else if !self.may_tell(&share.node, &lane, leadership) {
+            } else if !self.may_share(&share.node, &lane, leadership) {
                 RejectReason::Unattested
             } else if !is_plausible {
                 RejectReason::Implausible
@@ -381,7 +381,7 @@ impl LedgerResync {
     }
 
     /// True if a candidate may share the evidence of a lane.
-    fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
+    fn may_share(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
         let is_counting =
             |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
         if leadership.present_epoch().is_some_and(is_counting) {
@@ -541,18 +541,18 @@ impl LedgerResync {
     /// All evidence except one lane. If evidence is signed, a node's own counts are not used while
     /// it does not lead.
     fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
-        let is_told = |term: u64, aggregator: &NodeName| {
+        let is_shared = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
             except != Some(&lane)
                 && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
         };
         let entries: Vec<_> = ledger
             .entries()
-            .filter(|entry| is_told(entry.epoch, &entry.aggregator))
+            .filter(|entry| is_shared(entry.epoch, &entry.aggregator))
             .collect();
         let marks: Vec<_> = ledger
             .marks()
-            .filter(|mark| is_told(mark.epoch, &mark.aggregator))
+            .filter(|mark| is_shared(mark.epoch, &mark.aggregator))
             .collect();
         let mut shares = self.shares(ledger, &entries, &marks);
         let statements = ledger
@@ -581,24 +581,24 @@ impl LedgerResync {
         }
         self.wait = self.ticks_per_snapshot.max(1);
         self.repeats -= 1;
-        let is_told = |term: u64, aggregator: &NodeName| {
+        let is_shared = |term: u64, aggregator: &NodeName| {
             let is_leaders = self
                 .leader
                 .as_ref()
                 .is_some_and(|lane| lane.term == term && lane.leader == *aggregator);
-            leadership.knows_term(term) && !is_leaders
+            leadership.has_term(term) && !is_leaders
         };
         let (mut entries, mut marks) = ledger.beyond(&self.shared);
-        entries.retain(|entry| is_told(entry.epoch, &entry.aggregator));
-        marks.retain(|mark| is_told(mark.epoch, &mark.aggregator));
+        entries.retain(|entry| is_shared(entry.epoch, &entry.aggregator));
+        marks.retain(|mark| is_shared(mark.epoch, &mark.aggregator));
         if !self.is_signed {
             return self.shares(ledger, &entries, &marks);
         }
-        let untold = ledger.statements().filter(|share| {
+        let unsent = ledger.statements().filter(|share| {
             share.entries.iter().any(|entry| entries.contains(entry))
                 || share.marks.iter().any(|mark| marks.contains(mark))
         });
-        untold.map(|share| self.passed_on(share)).collect()
+        unsent.map(|share| self.passed_on(share)).collect()
     }
 
     /// Splits counts and marks into shares of at most [`MAX_SHARE_ENTRIES`]. A signed share

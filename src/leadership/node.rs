@@ -82,7 +82,7 @@ pub struct LeadershipNode {
     leadership: Leadership,
     status: NodeStatus,
     /// True if the current status was sent to the gateway.
-    is_status_told: bool,
+    is_status_published: bool,
     deadline: Timestamp,
     /// True if sockets are read before timers run, after a late wake-up.
     is_draining: bool,
@@ -149,7 +149,7 @@ impl LeadershipNode {
                 .map(|aggregator| Epoch::new(status.epoch, aggregator)),
             leadership: before.clone(),
             status,
-            is_status_told: false,
+            is_status_published: false,
             deadline: now,
             is_draining: false,
             effects: Vec::new(),
@@ -237,7 +237,7 @@ impl LeadershipNode {
             Input::OwnBroker { address } => self.own_broker = address,
             Input::BrokerProven { broker, node } => self.monitor.record_node(broker, node),
             Input::LinkChanged { broker, state } => self.on_link(&broker, state, now),
-            Input::StatusHeard { status } => self.on_status(&status, now),
+            Input::StatusReceived { status } => self.on_status(&status, now),
             Input::RoundAccepted { epoch, round } => self.on_round(epoch, round, now),
             Input::EvidenceReceived { from } => {
                 if let Some(preparation) = self
@@ -274,7 +274,7 @@ impl LeadershipNode {
             Input::GatewayRestarted => {
                 self.links.forget();
                 self.monitor.forget_links();
-                self.is_status_told = false;
+                self.is_status_published = false;
                 self.update_health(now);
             }
             Input::Described {
@@ -286,11 +286,11 @@ impl LeadershipNode {
                 self.keeps_reputations = keeps_reputations;
                 if self.status.description != description {
                     self.status.description = description;
-                    self.is_status_told = false;
+                    self.is_status_published = false;
                     self.feed(ElectionInput::Greet, now);
                 }
             }
-            Input::Telling {
+            Input::StatusParts {
                 troubles,
                 page,
                 dismissed,
@@ -301,7 +301,7 @@ impl LeadershipNode {
                     dismissed,
                     ..self.status.clone()
                 };
-                self.is_status_told &= status == self.status;
+                self.is_status_published &= status == self.status;
                 self.status = status;
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
@@ -494,7 +494,7 @@ impl LeadershipNode {
             self.member_down(name, now);
         }
         for member in members {
-            if !self.members.knows(&member) {
+            if !self.members.contains(&member) {
                 self.member_up(member, now);
             }
         }
@@ -709,13 +709,13 @@ impl LeadershipNode {
         let term = epoch.map_or(0, |epoch| epoch.term);
         let aggregator = epoch.map(|epoch| &epoch.leader);
         let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
-        let told = (
+        let published = (
             self.status.state,
             self.status.epoch,
             self.status.aggregator.as_ref(),
             self.status.fit,
         );
-        if !self.is_status_told || told != (state, term, aggregator, fit) {
+        if !self.is_status_published || published != (state, term, aggregator, fit) {
             let aggregator = aggregator.cloned();
             self.status = NodeStatus {
                 state,
@@ -724,7 +724,7 @@ impl LeadershipNode {
                 fit,
                 ..self.status.clone()
             };
-            self.is_status_told = true;
+            self.is_status_published = true;
             self.effects.push(Effect::PublishStatus {
                 status: self.status.clone(),
             });

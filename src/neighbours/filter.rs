@@ -185,7 +185,7 @@ impl CellMapFilter {
     }
 
     /// True if a map of the cell arrived recently.
-    pub fn knows(&self, cell: &NodeName) -> bool {
+    pub fn has_cell(&self, cell: &NodeName) -> bool {
         self.cells.contains_key(cell)
     }
 }

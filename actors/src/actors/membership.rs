@@ -163,17 +163,17 @@ impl Actor for Membership {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
         }
         if !config.seeds.is_empty() {
-            let told = Arc::clone(&events);
+            let report = Arc::clone(&events);
             let trouble = move |seed: &str, error: &io::Error| {
                 let cause = format!("cannot be resolved: {error}");
-                told(MembershipEvent::Troubled {
+                report(MembershipEvent::Troubled {
                     about: seed.to_owned(),
                     kind: TroubleKind::Unresolved,
                     cause,
                 });
             };
             let membership = myself.clone();
-            let tell = move |addresses| {
+            let set_seeds = move |addresses| {
                 membership
                     .cast(MembershipMessage::SetSeeds { addresses })
                     .is_ok()
@@ -182,7 +182,7 @@ impl Actor for Membership {
                 config.seeds,
                 address.is_ipv4(),
                 trouble,
-                tell,
+                set_seeds,
             ));
         }
         members.send_replace(Vec::new());
@@ -292,7 +292,7 @@ impl MembershipState {
             let sent = match output {
                 GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
                 GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
-                GossipOutput::Tell(event) => {
+                GossipOutput::Event(event) => {
                     changed |= !matches!(
                         event,
                         MembershipEvent::Received { .. } | MembershipEvent::Troubled { .. }
@@ -377,9 +377,9 @@ impl MembershipState {
     /// Publishes the list of living members if it has changed.
     fn publish_members(&self) {
         let members = self.machine.members();
-        self.members.send_if_modified(|told| {
-            let has_changed = *told != members;
-            *told = members;
+        self.members.send_if_modified(|published| {
+            let has_changed = *published != members;
+            *published = members;
             has_changed
         });
     }

@@ -373,10 +373,10 @@ impl UplinkState {
     }
 
     /// Repeats the node's own status if a last will or a former leader has replaced it.
-    fn on_neighbour_status(&mut self, heard: &NodeStatus) {
+    fn on_neighbour_status(&mut self, status: &NodeStatus) {
         let own = self.own_status();
-        let is_former = (heard.epoch, &heard.node) < (own.epoch, &own.node);
-        if heard.state == NodeState::Offline || is_former {
+        let is_former = (status.epoch, &status.node) < (own.epoch, &own.node);
+        if status.state == NodeState::Offline || is_former {
             self.publish_status();
         }
     }

@@ -280,7 +280,7 @@ async fn compare(
         let verdict = target.votes.then(|| Ways::of(&cell.verdict, &bare.verdict));
         for (answer, ways) in [("map", Some(&map)), ("verdict", verdict.as_ref())] {
             let Some(ways) = ways else { continue };
-            ways.tell(vehicles, answer, &mut rows);
+            ways.add_rows(vehicles, answer, &mut rows);
             figures.goal(
                 format!("vehicles_{vehicles}_{answer}_p50_ratio"),
                 ways.p50_ratio,
@@ -327,7 +327,7 @@ impl Ways {
         }
     }
 
-    fn tell(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
+    fn add_rows(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
         for (way, quantiles) in [("cell", self.cell), ("bare", self.bare)] {
             let Quantiles {
                 p50_us,
@@ -368,7 +368,7 @@ async fn saturate(
         "\nvehicles    map ms p50, p99   verdict ms p50, p99   missing  refused  late ms   map kB  verdict kB  ",
     )?;
     print("broker %  aggregator %  vehicles %\n")?;
-    let tell = |step: &Step| {
+    let print_step = |step: &Step| {
         let times = |latency: Option<Quantiles>| {
             let [p50, p99] = [
                 latency.map(|latency| latency.p50_us),
@@ -396,7 +396,7 @@ async fn saturate(
         ))
     };
     let most = usize::from(arguments.up_to);
-    let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, tell).await?;
+    let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, print_step).await?;
     let carried = found
         .most_vehicles
         .map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());

@@ -37,7 +37,9 @@ use serde::Serialize;
 use super::judged_term::{JudgedTerm, judged_terms};
 use super::report_collector::ObservedReport;
 use super::stage::{Played, Progress, Stage};
-use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
+use crate::eval::tracks::{
+    DEFAULT_THRESHOLD, MATCH_DISTANCE_M, ReportedObject, ScoredFrame, score,
+};
 use crate::street::network_camera::{FRAMES_PER_S, NetworkCamera};
 use crate::street::{Carrier, Street, StreetCamera};
 
@@ -443,7 +445,7 @@ impl Judge<'_> {
         let said = map
             .into_iter()
             .flat_map(|map| &map.objects)
-            .map(|object| SaidObject::of(object, ids));
+            .map(|object| ReportedObject::of(object, ids));
         ScoredFrame {
             said: said.collect(),
             truth: self.street.truth(at.since(self.start).as_secs_f64()),

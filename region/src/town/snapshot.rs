@@ -255,7 +255,7 @@ impl TownTotals {
         self.cells += 1;
         let number = match state {
             CellState::Live => &mut self.live,
-            CellState::Told => &mut self.told,
+            CellState::Claimed => &mut self.told,
             CellState::Silent => &mut self.silent,
             CellState::Offline => &mut self.offline,
         };

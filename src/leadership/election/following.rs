@@ -337,7 +337,7 @@ impl Election {
         // followers that do not receive the other leader's next beat for a while.
         let current = self.current_epoch().cloned();
         let is_corrected = self.peers.correct(from, &self.id, current.as_ref());
-        if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.told) {
+        if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.is_confirmed) {
             return;
         }
         if self.is_leading() {

@@ -32,7 +32,7 @@ pub(super) struct Peer {
     /// Epoch that the peer follows or leads, according to its last message.
     pub(super) epoch: Option<Epoch>,
     /// True if the last message to the peer confirmed that this node receives it.
-    pub(super) told: bool,
+    pub(super) is_confirmed: bool,
     /// True while the peer refuses this node's leadership.
     refuses: bool,
     /// Candidates at whose brokers the peer reports that it cannot log in.
@@ -116,14 +116,14 @@ impl Peers {
     }
 
     /// Records that a message is sent to a peer. Returns the `hears_you` flag for that message.
-    pub(super) fn tell(&mut self, name: &NodeName, now: Timestamp) -> bool {
+    pub(super) fn record_sent(&mut self, name: &NodeName, now: Timestamp) -> bool {
         let Some(peer) = self.table.get_mut(name) else {
             return false;
         };
-        peer.told = peer
+        peer.is_confirmed = peer
             .heard_at
             .is_some_and(|at| now.since(at) <= self.contact_timeout);
-        peer.told
+        peer.is_confirmed
     }
 
     /// True if a peer follows a leadership of `leader` that is over and has not been notified of
@@ -242,7 +242,7 @@ impl Peers {
         }
         // A new run, or a peer that was out of contact, has to be informed again that this node
         // receives it.
-        peer.told &= !silent && message.run == peer.run;
+        peer.is_confirmed &= !silent && message.run == peer.run;
         peer.run = message.run;
         peer.seq = message.seq;
         peer.heard_at = Some(now);

@@ -97,7 +97,7 @@ pub enum Input {
         state: LinkState,
     },
     /// A broker forwarded a node's status or its last will.
-    StatusHeard {
+    StatusReceived {
         /// The status; its state is `offline` in a last will.
         status: NodeStatus,
     },
@@ -142,7 +142,7 @@ pub enum Input {
         keeps_reputations: bool,
     },
     /// Parts of the node's published status. This input may come with every check.
-    Telling {
+    StatusParts {
         /// All current troubles of the node.
         troubles: Vec<Trouble>,
         /// Address and port of its page.

@@ -159,7 +159,7 @@ impl World {
             let is_of_leader = |now: &Epoch| now.leader == lane.leader && lane <= *now;
             let is_told_by_another = share.node != lane.leader
                 && node.leadership.present_epoch().is_some_and(is_of_leader);
-            node.leadership.knows_term(term) && !is_told_by_another
+            node.leadership.has_term(term) && !is_told_by_another
         };
         let entries = share
             .entries

@@ -209,7 +209,7 @@ impl ElectionDriver {
             let complaint = status.troubles.iter().find(of_this).cloned();
             self.complaint = complaint.map(|trouble| (status.node.clone(), trouble));
         }
-        self.handle(Input::StatusHeard {
+        self.handle(Input::StatusReceived {
             status: status.clone(),
         })
         .await;
@@ -220,7 +220,7 @@ impl ElectionDriver {
     /// # Example
     /// The timer fires: the input is [`Input::Wake`]. The leadership returns a beat for `gauss`,
     /// which goes to the membership, and [`Effect::Look`], whose answers are the inputs
-    /// [`Input::Looked`] and [`Input::Telling`]. Both are processed, and the timer is set for the
+    /// [`Input::Looked`] and [`Input::StatusParts`]. Both are processed, and the timer is set for the
     /// next deadline.
     pub(super) async fn handle(&mut self, input: Input) {
         if input == Input::Wake {
@@ -262,7 +262,7 @@ impl ElectionDriver {
                     .membership
                     .send(MembershipMessage::Send { to, payload });
             }
-            Effect::PublishLeadership { leadership } => self.tell(leadership),
+            Effect::PublishLeadership { leadership } => self.publish_leadership(leadership),
             Effect::Lead {
                 epoch,
                 first_round,
@@ -332,7 +332,7 @@ impl ElectionDriver {
                 let troubles = self.counters.troubles().present();
                 return vec![
                     looked,
-                    Input::Telling {
+                    Input::StatusParts {
                         troubles,
                         page,
                         dismissed,
@@ -426,7 +426,7 @@ impl ElectionDriver {
     }
 
     /// Publishes the leadership; a change of only the highest term does not notify readers.
-    fn tell(&self, leadership: Leadership) {
+    fn publish_leadership(&self, leadership: Leadership) {
         let Leadership {
             position,
             epoch,

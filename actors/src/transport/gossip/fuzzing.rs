@@ -79,7 +79,7 @@ impl Listener {
                         GossipOutput::Send { frame, .. } | GossipOutput::Multicast { frame } => {
                             under_way.push_back((index, frame))
                         }
-                        GossipOutput::Tell(_) | GossipOutput::Renewal { .. } => (),
+                        GossipOutput::Event(_) | GossipOutput::Renewal { .. } => (),
                     }
                 }
             }

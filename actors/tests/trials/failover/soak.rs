@@ -148,7 +148,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         };
         println!(
             "minute {number} of {minutes}: {disturbance}; {}",
-            tell(&minute)
+            summary_of(&minute)
         );
         past.push(minute);
     }
@@ -213,7 +213,7 @@ fn longest_gap(runs: &[NodeRun], (from, until): (Timestamp, Timestamp)) -> Durat
     waits.max().unwrap_or_default()
 }
 
-fn tell(minute: &Minute) -> String {
+fn summary_of(minute: &Minute) -> String {
     let recovered = match minute.recovered_after_ms {
         Some(ms) => format!("all well {:.1} s later", ms as f64 / 1000.0),
         None => "NOT RECOVERED".to_owned(),

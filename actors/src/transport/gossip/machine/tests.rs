@@ -171,10 +171,10 @@ impl Cell {
                         sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
                     }
                     GossipOutput::Multicast { .. } | GossipOutput::Renewal { .. } => (),
-                    GossipOutput::Tell(MembershipEvent::Troubled { about, kind, .. }) => {
+                    GossipOutput::Event(MembershipEvent::Troubled { about, kind, .. }) => {
                         node.troubles.insert((about, kind));
                     }
-                    GossipOutput::Tell(event) => node.events.push(event),
+                    GossipOutput::Event(event) => node.events.push(event),
                 }
             }
         }

@@ -137,8 +137,8 @@ proptest! {
         prop_assert_eq!(node.machine.members(), members);
         while let Some(output) = node.machine.poll() {
             // A greeting with a wrong seal may come from a node with another key.
-            let is_notice = matches!(output, GossipOutput::Tell(MembershipEvent::Troubled { .. }));
-            prop_assert!(is_notice || !matches!(output, GossipOutput::Tell(_)), "{:?}", output);
+            let is_notice = matches!(output, GossipOutput::Event(MembershipEvent::Troubled { .. }));
+            prop_assert!(is_notice || !matches!(output, GossipOutput::Event(_)), "{:?}", output);
         }
     }
 }
