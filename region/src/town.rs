@@ -270,8 +270,8 @@ impl RegionTown {
     }
 
     /// Drops outdated maps, for example of tiles that are out of view.
-    pub fn forget_old_maps(&mut self, now: Timestamp) {
-        self.filter.forget_silent(now);
+    pub fn drop_old_maps(&mut self, now: Timestamp) {
+        self.filter.drop_silent(now);
         for cell in self.cells.values_mut() {
             cell.map = cell
                 .map

@@ -271,7 +271,7 @@ impl Election {
     /// Removes peers that were given up, then carries out what is due in the current state. A
     /// follower that loses its leader starts to seek, and may claim leadership in the same call.
     fn run_timers(&mut self, now: Timestamp) {
-        self.peers.forget_silent(now);
+        self.peers.drop_silent(now);
         if let State::Following(_) = self.state {
             self.follow_timers(now);
         }
@@ -327,7 +327,7 @@ impl Election {
         if self.terms.window.0 == 0 {
             self.terms.window = (self.terms.seen, now);
         }
-        self.on_foreign_message(&message, now);
+        self.on_other_leadership(&message, now);
         let ElectionMessage {
             from,
             epoch,

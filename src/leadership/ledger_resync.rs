@@ -22,7 +22,7 @@
 //!
 //! A node that starts may first receive a false claimant, and follows it until the true leader
 //! renews its term. For this reason an aggregator's own evidence is on probation until its
-//! leadership has been followed for [`EVIDENCE_TRIAL`]. Until then it counts on this node only,
+//! leadership has been followed for [`EVIDENCE_PROBATION`]. Until then it counts on this node only,
 //! because leadership may be handed to this node. It is dropped when the node follows another
 //! leader, which shares the evidence of its predecessors. If an honest leader led only for a short
 //! time, it shares its counts when it leads again.
@@ -36,7 +36,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use crate::leadership::timers::{
-    EVIDENCE_TRIAL, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD,
+    EVIDENCE_PROBATION, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD,
 };
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
@@ -299,11 +299,11 @@ impl LedgerResync {
             && taken
                 .lane()
                 .is_some_and(|lane| !self.has_counted(&lane, ledger));
-        let trial_ends_at = self
-            .trial_end(&share.node, now)
+        let probation_ends_at = self
+            .probation_end(&share.node, now)
             .filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
-        let is_news = match trial_ends_at {
-            Some(ends_at) if is_statement => ledger.merge_on_trial(&taken, present, ends_at),
+        let is_news = match probation_ends_at {
+            Some(ends_at) if is_statement => ledger.merge_on_probation(&taken, present, ends_at),
             None if is_statement => ledger.merge_statement(&taken, present),
             Some(_) | None => ledger.merge_share(&taken, present),
         };
@@ -415,7 +415,7 @@ impl LedgerResync {
         let has_failed = |lane: &Epoch| {
             leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader))
         };
-        let judged = ledger.end_trials(now, has_failed);
+        let judged = ledger.end_probations(now, has_failed);
         if judged
             .iter()
             .any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane))
@@ -428,10 +428,10 @@ impl LedgerResync {
     }
 
     /// End of the probation of a leader's own evidence, or `None` if it has ended.
-    fn trial_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
+    fn probation_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
         self.followed
             .get(leader)
-            .map(|followed| followed.since + EVIDENCE_TRIAL)
+            .map(|followed| followed.since + EVIDENCE_PROBATION)
             .filter(|ends_at| *ends_at > now)
     }
 

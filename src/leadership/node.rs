@@ -248,7 +248,7 @@ impl LeadershipNode {
                     preparation.has_evidence = true;
                 }
             }
-            Input::Looked {
+            Input::Observed {
                 rounds_due,
                 load_percent,
                 members,
@@ -272,8 +272,8 @@ impl LeadershipNode {
                 }
             }
             Input::GatewayRestarted => {
-                self.links.forget();
-                self.monitor.forget_links();
+                self.links.clear_wanted();
+                self.monitor.drop_links();
                 self.is_status_published = false;
                 self.update_health(now);
             }
@@ -311,7 +311,7 @@ impl LeadershipNode {
     /// Requests a check of the node's parts if one is due, and continues a preparation.
     fn run_timers(&mut self, now: Timestamp) {
         if self.monitor.is_due(now) {
-            self.effects.push(Effect::Look);
+            self.effects.push(Effect::Observe);
             // A vehicle only checks whether a login of unclear state is present.
             if !self.is_vehicle_only || self.logins.is_doubtful() {
                 self.effects.push(Effect::AskParts);
@@ -395,7 +395,7 @@ impl LeadershipNode {
     fn member_up(&mut self, member: SeenMember, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
-        self.forget_login(&peer, now);
+        self.remove_login(&peer, now);
         self.feed(ElectionInput::PeerAlive { peer }, now);
         self.update_health(now);
     }
@@ -404,7 +404,7 @@ impl LeadershipNode {
     /// whether it is lost.
     fn member_down(&mut self, name: NodeName, now: Timestamp) {
         self.members.member_down(&name, now);
-        self.forget_login(&name, now);
+        self.remove_login(&name, now);
         self.feed(ElectionInput::PeerDown { peer: name }, now);
     }
 
@@ -525,7 +525,7 @@ impl LeadershipNode {
             )
         };
         let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
-        if self.logins.look(&brokers.collect()) {
+        if self.logins.record(&brokers.collect()) {
             self.report_logins(now);
         }
         let (without_login, followers) = self.election.followers_without_login();
@@ -546,8 +546,8 @@ impl LeadershipNode {
 
     /// Removes the record of a login at a node's broker, because the node left or restarted;
     /// reports the change if the login was missing.
-    fn forget_login(&mut self, name: &NodeName, now: Timestamp) {
-        if self.logins.forget(name) {
+    fn remove_login(&mut self, name: &NodeName, now: Timestamp) {
+        if self.logins.remove(name) {
             self.report_logins(now);
         }
     }
@@ -681,7 +681,7 @@ impl LeadershipNode {
             },
         };
         if let Some(links) = self.links.update(brokers, now) {
-            self.monitor.forget_links_but(&links.brokers);
+            self.monitor.drop_links_except(&links.brokers);
             self.effects.push(Effect::SetLinks { links });
         }
         self.publish_status();

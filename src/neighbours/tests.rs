@@ -361,7 +361,7 @@ fn common_backlog_is_no_clock() {
 }
 
 #[test]
-fn a_silent_cell_is_forgotten() {
+fn silent_cell_is_dropped() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     assert_eq!(neighbours.near(ms(3400)).len(), 1);

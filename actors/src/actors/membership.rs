@@ -115,7 +115,7 @@ impl Actor for Membership {
         let key = CellKey::load(&config, &cell)?;
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
-        log_who_can_take_part(&config, credentials.is_some(), address);
+        log_admission(&config, credentials.is_some(), address);
         let mut certificates = credentials.clone().map(CertificateWatch::new);
         let identity = certificates.as_mut().map(CertificateWatch::identity);
         let renewals = credentials
@@ -523,7 +523,7 @@ fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
     Ok((session, secret, u64::from_le_bytes(seed)))
 }
 
-fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
+fn log_admission(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     if config.has_key() && proves {
         tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
     } else if config.has_key() {

@@ -117,7 +117,7 @@ impl Actor for Uplink {
             myself.clone(),
         ));
         let mut state = UplinkState::new(arguments, watcher);
-        state.look(&myself);
+        state.update(&myself);
         Ok(state)
     }
 
@@ -128,7 +128,7 @@ impl Actor for Uplink {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            UplinkMessage::Look => state.look(&myself),
+            UplinkMessage::Update => state.update(&myself),
             UplinkMessage::Reconnect => {
                 if let Some(link) = &mut state.link {
                     link.reconnect(events_to(&myself));
@@ -190,7 +190,7 @@ impl UplinkState {
     }
 
     /// Connects, disconnects or publishes, depending on the leadership and the newest map.
-    fn look(&mut self, myself: &ActorRef<UplinkMessage>) {
+    fn update(&mut self, myself: &ActorRef<UplinkMessage>) {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
         match (leads, self.setup.origin) {
@@ -369,7 +369,7 @@ impl UplinkState {
         if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);
         }
-        self.look(myself);
+        self.update(myself);
     }
 
     /// Repeats the node's own status if a last will or a former leader has replaced it.
@@ -457,7 +457,7 @@ async fn watch_cell(
             changed = leadership.changed() => changed,
             changed = newest.changed() => changed,
         };
-        if changed.is_err() || uplink.cast(UplinkMessage::Look).is_err() {
+        if changed.is_err() || uplink.cast(UplinkMessage::Update).is_err() {
             return;
         }
     }

@@ -40,7 +40,7 @@ fn seen_by(node: &Member) -> Vec<(String, Role)> {
 
 /// All declare to be an edge; other nodes use the roles that the certificates allow.
 #[tokio::test]
-async fn nodes_meet_only_with_certificates() {
+async fn nodes_join_only_with_certificates() {
     let mut pki = Pki::new();
     let [edge, euclid] = [
         pki.issue("edge", Role::Edge, DAY),

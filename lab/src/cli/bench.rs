@@ -125,7 +125,7 @@ const PASSES: u64 = 4;
 const COST_VEHICLES: usize = 32;
 
 /// Time for which the vehicles report while a browser shows the page.
-const LOOK: Duration = Duration::from_secs(4);
+const PAGE_TIME: Duration = Duration::from_secs(4);
 
 /// The load at which the search begins.
 const SEARCH_FROM: usize = 4;
@@ -429,12 +429,12 @@ async fn costs(
         ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds))
     };
     let mut usages = Vec::new();
-    let mut looked = None;
+    let mut viewed = None;
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
         let measured = measure(aggregator.target()?, load).await?;
         if !records {
-            looked = Some(look(&mut aggregator).await?);
+            viewed = Some(page_figures(&mut aggregator).await?);
         }
         aggregator.stop().await;
         usages.push(measured.aggregator.context("the aggregator ended")?);
@@ -466,9 +466,9 @@ async fn costs(
         added,
         5.0,
     );
-    let looked = looked.context("nobody looked")?;
-    let page_kb = looked.bytes as f64 / 1e3;
-    let first_picture_ms = looked.first_picture.as_secs_f64() * 1e3;
+    let viewed = viewed.context("nobody looked")?;
+    let page_kb = viewed.bytes as f64 / 1e3;
+    let first_picture_ms = viewed.first_picture.as_secs_f64() * 1e3;
     print(&format!(
         "its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"
     ))?;
@@ -546,19 +546,19 @@ async fn doors(
 }
 
 /// Figures of the page as a browser gets it while the vehicles report.
-async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
+async fn page_figures(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
     let address = aggregator.page();
     let load = Load {
         bare: false,
-        ..Load::new(COST_VEHICLES, LOOK)
+        ..Load::new(COST_VEHICLES, PAGE_TIME)
     };
-    let looked = async {
-        tokio::time::sleep(LOOK / 2).await;
+    let viewed = async {
+        tokio::time::sleep(PAGE_TIME / 2).await;
         page::fetch(address).await
     };
-    let (measured, looked) = tokio::join!(measure(aggregator.target()?, load), looked);
+    let (measured, viewed) = tokio::join!(measure(aggregator.target()?, load), viewed);
     measured?;
-    looked
+    viewed
 }
 
 impl Figures {

@@ -104,7 +104,7 @@ pub struct KnownShare {
 const STEP: Duration = Duration::from_millis(100);
 
 /// Age of a map from which on a node counts as having no objects.
-const FORGOTTEN: Duration = Duration::from_secs(1);
+const STALE_AFTER: Duration = Duration::from_secs(1);
 
 /// Time between two poses of a vehicle that drives.
 const POSE_PERIOD: Duration = Duration::from_millis(50);
@@ -429,7 +429,7 @@ impl Judge<'_> {
                 .take_while(|line| line.received_at <= at)
                 .count();
             let newest = next.checked_sub(1).map(|place| &maps[place]);
-            let known = newest.filter(|line| at.since(line.received_at) < FORGOTTEN);
+            let known = newest.filter(|line| at.since(line.received_at) < STALE_AFTER);
             frames.push(self.frame(at, known.map(|line| &*line.map), &mut ids));
             at = at + STEP;
         }

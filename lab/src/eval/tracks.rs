@@ -309,7 +309,7 @@ impl TrackEvaluation {
 
     /// The classes of the reported objects and of the truth, if both have some, but not one in
     /// common.
-    pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
+    pub fn labels_without_match(&self) -> Option<(String, String)> {
         let said: BTreeSet<&Label> = self
             .maps
             .iter()

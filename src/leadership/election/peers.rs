@@ -67,7 +67,7 @@ pub(super) struct Peers {
     given_up_timeout: Duration,
     standby_silence: Duration,
     /// Time of the next check for peers that were given up and have been silent since.
-    forget_at: Option<Timestamp>,
+    drop_at: Option<Timestamp>,
 }
 
 impl Peers {
@@ -80,7 +80,7 @@ impl Peers {
             response_timeout: config.response_timeout(),
             given_up_timeout: config.given_up_timeout(),
             standby_silence: config.standby_silence(),
-            forget_at: None,
+            drop_at: None,
         }
     }
 
@@ -274,19 +274,19 @@ impl Peers {
             self.table.remove(name);
         } else {
             peer.given_up_at = Some(now);
-            self.forget_at.get_or_insert(now + self.given_up_timeout);
+            self.drop_at.get_or_insert(now + self.given_up_timeout);
         }
     }
 
     /// Removes the peers that were given up and have been silent since.
-    pub(super) fn forget_silent(&mut self, now: Timestamp) {
-        if self.forget_at.is_none_or(|at| now < at) {
+    pub(super) fn drop_silent(&mut self, now: Timestamp) {
+        if self.drop_at.is_none_or(|at| now < at) {
             return;
         }
         let wait = self.given_up_timeout;
         self.table
             .retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
-        self.forget_at = self
+        self.drop_at = self
             .table
             .values()
             .filter_map(|peer| peer.given_up_at)
@@ -301,7 +301,7 @@ impl Peers {
     }
 
     /// Restarts the time for which a peer must be stable before leadership is handed to it.
-    pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
+    pub(super) fn restart_stability(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.fit_since = peer.fit_since.map(|_| now);
         }

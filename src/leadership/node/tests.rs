@@ -94,7 +94,7 @@ impl Scene {
     fn handle_input(&mut self, input: Input) {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
-                Effect::Look => Input::Looked {
+                Effect::Observe => Input::Observed {
                     rounds_due: self.rounds_due,
                     load_percent: 0,
                     members: self.members.clone(),

@@ -164,7 +164,7 @@ impl VehicleBelief {
 
     /// Drops beliefs that were last observed before `limit`; returns the time of the oldest one
     /// left, if any is.
-    pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
+    pub(super) fn drop_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
         if self.oldest_seen.is_some_and(|oldest| oldest < limit) {
             let mut beliefs = self.beliefs.iter();
             self.places.retain(|_| {

@@ -193,7 +193,7 @@ impl World {
             node.name
         );
         node.saved.clone_from(&node.ledger);
-        node.saved.end_trials(now, |_| true);
+        node.saved.end_probations(now, |_| true);
         let shares = node
             .resync
             .tick(&mut node.ledger, &node.leadership, now)

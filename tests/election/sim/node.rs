@@ -87,7 +87,7 @@ pub(crate) enum Arrival {
         share: Box<LedgerShare>,
     },
     /// News of the membership.
-    Tell {
+    Membership {
         about: usize,
         about_life: u64,
         is_there: bool,

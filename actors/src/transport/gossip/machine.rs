@@ -349,7 +349,7 @@ impl GossipMachine {
             FrameContent::Answer(frame) => self
                 .outputs
                 .push_back(GossipOutput::Send { to: from, frame }),
-            FrameContent::Met {
+            FrameContent::Introduced {
                 introduction,
                 answer,
                 speaks,
@@ -359,7 +359,7 @@ impl GossipMachine {
                 self.outputs
                     .extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
                 let name = introduction.id.name.clone();
-                self.meet(introduction, from, speaks, greeter, at);
+                self.on_introduction(introduction, from, speaks, greeter, at);
                 let moved = self.gossip.alive().get(&name).filter(|_| has_moved);
                 if let Some(id) = moved {
                     let member = self.member(id);
@@ -391,7 +391,7 @@ impl GossipMachine {
             }),
             FrameContent::Stranger => self.send_hello(from, true, at),
             FrameContent::NameTaken(name) => self.report_taken(&name, second_run(from), at),
-            FrameContent::Namesake { id, answer } => self.meet_namesake(&id, answer, from, at),
+            FrameContent::Namesake { id, answer } => self.on_namesake(&id, answer, from, at),
             FrameContent::Nothing => (),
         }
         Ok(())
@@ -400,7 +400,7 @@ impl GossipMachine {
     /// Processes the handshake of an admitted node: its claims to this node's name, then its
     /// identity. `speaks` is true if its session is accepted for its name, `greeter` if this node
     /// began the handshake.
-    fn meet(
+    fn on_introduction(
         &mut self,
         introduction: Introduction,
         from: SocketAddr,
@@ -465,7 +465,7 @@ impl GossipMachine {
                     member: self.member(&id),
                 },
                 SwimOutput::Unproven(id) => {
-                    self.meet_unproven(id, at);
+                    self.greet_unproven(id, at);
                     continue;
                 }
                 SwimOutput::Suspected(name) => MembershipEvent::Suspected { name },
@@ -514,7 +514,7 @@ impl GossipMachine {
     }
 
     /// Greets a node that other nodes mention and whose certificate this node has not seen.
-    fn meet_unproven(&mut self, id: NodeId, at: Timestamp) {
+    fn greet_unproven(&mut self, id: NodeId, at: Timestamp) {
         self.unproven
             .retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
         let is_new = self.unproven.len() < MAX_UNPROVEN && !self.unproven.contains_key(&id.name);
@@ -611,7 +611,7 @@ impl GossipMachine {
     /// Handles another node with this node's name: informs it that it is the second one, or accepts
     /// that this node is. A node that has just started is the second one; if the two discover each
     /// other late, it is the node that started later.
-    fn meet_namesake(
+    fn on_namesake(
         &mut self,
         id: &NodeId,
         answer: Option<Vec<u8>>,

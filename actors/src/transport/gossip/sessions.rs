@@ -102,7 +102,7 @@ pub(crate) enum FrameContent {
     /// A step of a handshake, with the answer to send.
     Answer(Vec<u8>),
     /// A node was admitted. The answer informs the node, unless it already has the session.
-    Met {
+    Introduced {
         introduction: Introduction,
         answer: Option<Vec<u8>>,
         /// True if its session is accepted for its name.
@@ -295,7 +295,7 @@ impl Sessions {
 
     /// Removes all sessions, as if other sessions had replaced them.
     #[cfg(test)]
-    pub(crate) fn forget_all(&mut self) {
+    pub(crate) fn drop_all(&mut self) {
         self.peers.expel(|_| true);
     }
 

@@ -326,7 +326,7 @@ fn unmatched_classes_are_listed() {
             })
             .collect();
         evaluation.add_objects(Timestamp(100), &objects);
-        evaluation.labels_that_never_meet()
+        evaluation.labels_without_match()
     };
     assert_eq!(with(&["person", "car"]), None);
     assert_eq!(with(&[]), None);

@@ -152,7 +152,7 @@ impl Sessions {
                             answer,
                         });
                     }
-                    return Ok(FrameContent::Met {
+                    return Ok(FrameContent::Introduced {
                         introduction,
                         answer,
                         speaks: claim != NameClaim::Taken,
@@ -180,7 +180,7 @@ impl Sessions {
                     });
                 }
                 let claim = self.admit(head, &introduction.id, admission, arrival)?;
-                Ok(FrameContent::Met {
+                Ok(FrameContent::Introduced {
                     introduction,
                     answer: None,
                     speaks: claim != NameClaim::Taken,
@@ -329,7 +329,7 @@ impl Sessions {
         let has_moved = self.has_moved(head, arrival);
         let claim = self.admit(head, &introduction.id, admission, arrival)?;
         let answer = self.write_handshake(&own_head, &head.sender, &accept, &own_attestation);
-        Ok(FrameContent::Met {
+        Ok(FrameContent::Introduced {
             introduction,
             answer: Some(answer),
             speaks: claim != NameClaim::Taken,
