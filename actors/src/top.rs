@@ -177,17 +177,17 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         Some(age) => Span::from(format!("newest round {} ms old", age.as_millis())).green(),
         None => Span::from("no round yet").yellow(),
     };
-    let before: Vec<_> = view
+    let epochs: Vec<_> = view
         .history
         .iter()
         .rev()
         .skip(1)
         .map(|(epoch, _)| epoch.to_string())
         .collect();
-    let before = if before.is_empty() {
+    let before = if epochs.is_empty() {
         String::new()
     } else {
-        format!("  before: {}", before.join(", "))
+        format!("  before: {}", epochs.join(", "))
     };
     let lines = vec![
         Line::from(vec![leader, "  ".into(), freshness]),

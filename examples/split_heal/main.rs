@@ -196,7 +196,7 @@ impl Cell {
             .flat_map(|vehicle| &vehicle.settled)
             .collect();
         for (epoch, settled) in settled {
-            let held = |vehicle: &Vehicle| {
+            let held_by = |vehicle: &Vehicle| {
                 let lane = vehicle
                     .ledger
                     .entries()
@@ -204,7 +204,7 @@ impl Cell {
                 lane.map(|entry| entry.correct + entry.incorrect)
                     .sum::<u64>()
             };
-            let held: Vec<_> = self.vehicles.iter().map(held).collect();
+            let held: Vec<_> = self.vehicles.iter().map(held_by).collect();
             println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
             ensure!(*settled > 0, "{epoch} settled no votes");
             ensure!(

@@ -141,13 +141,17 @@ impl CellTime {
         };
         // The cell's time, unless more clocks agree on another time.
         let times = [0].into_iter().chain(errors.iter().map(|(_, us)| *us));
-        let time = times
+        let agreed = times
             .rev()
             .max_by_key(|time| agree(*time))
             .unwrap_or_default();
-        let is_cell_wrong = time.abs() >= micros(MIN_CLOCK_JUMP);
-        let is_certain = agree(time) > 1;
-        let time = if is_cell_wrong && is_certain { time } else { 0 };
+        let is_cell_wrong = agreed.abs() >= micros(MIN_CLOCK_JUMP);
+        let is_certain = agree(agreed) > 1;
+        let time = if is_cell_wrong && is_certain {
+            agreed
+        } else {
+            0
+        };
         let errors = errors
             .into_iter()
             .map(|(node, us)| (node, us.saturating_sub(time)));

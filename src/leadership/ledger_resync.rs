@@ -302,13 +302,13 @@ impl LedgerResync {
         let probation_ends_at = self
             .probation_end(&share.node, now)
             .filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
-        let is_news = match probation_ends_at {
+        let is_merged = match probation_ends_at {
             Some(ends_at) if is_statement => ledger.merge_on_probation(&taken, present, ends_at),
             None if is_statement => ledger.merge_statement(&taken, present),
             Some(_) | None => ledger.merge_share(&taken, present),
         };
         self.growth.record(&taken, ledger, now);
-        let is_news = is_news | is_reset | has_judged;
+        let is_news = is_merged | is_reset | has_judged;
         Ok(Merged {
             is_news,
             refused,
@@ -620,11 +620,11 @@ impl LedgerResync {
         // Evidence can be signed only if it belongs to one lane.
         let is_together =
             |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
-        let entries = entries
+        let lanes = entries
             .chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
         let marks =
             marks.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
-        let entries = entries
+        let entries = lanes
             .flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES))
             .map(|entries| share(entries, &[]));
         entries

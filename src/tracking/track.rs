@@ -314,7 +314,7 @@ impl Track {
         existence: f64,
         name: impl Fn(SensorId) -> Option<NodeName>,
     ) -> FusedObject {
-        let covariance = self.state.covariance_at(now);
+        let matrix = self.state.covariance_at(now);
         let position = self.state.position_at(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
@@ -323,12 +323,12 @@ impl Track {
                 .iter()
                 .map(|(label, weight)| (label.clone(), weight / total.max(1e-9))),
         );
-        let sigma_m = (covariance.trace() / 2.0).sqrt();
+        let sigma_m = (matrix.trace() / 2.0).sqrt();
         let usable = 1.0 - (-ERROR_RATE * USABLE_M / sigma_m).exp();
         let covariance = Covariance {
-            xx: covariance.m11,
-            xy: covariance.m12,
-            yy: covariance.m22,
+            xx: matrix.m11,
+            xy: matrix.m12,
+            yy: matrix.m22,
         };
         let confidence = existence * usable;
         let has_velocity = self.hits > 1;

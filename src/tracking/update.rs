@@ -477,12 +477,12 @@ impl InstantUpdate<'_> {
             .coverage
             .centre()
             .map_or(0.0, |centre| (observation.place - centre).norm());
-        let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
+        let judged = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
         let is_shifted = || {
             let mut histories = track.history.iter();
             histories.any(|history| history.sensor == vehicle && history.is_shifted)
         };
-        let judgement = match judgement {
+        let judgement = match judged {
             None => return,
             Some(Judgement::Correct) if is_shifted() => Judgement::Shifted,
             Some(judgement) => judgement,

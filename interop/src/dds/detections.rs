@@ -286,9 +286,9 @@ pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), Re
         position,
         orientation,
     } = stamped.pose;
-    let ahead = orientation.rotation().map(|turn| turn * Vector3::x());
+    let turned = orientation.rotation().map(|turn| turn * Vector3::x());
     let bad = || InputRefusal::BadPose.with(format!("{stamped:?}"));
-    let ahead = ahead
+    let ahead = turned
         .filter(|_| stamped.header.frame_id == "map")
         .ok_or_else(bad)?;
     let pose = Pose::new(position.x, position.y, ahead.y.atan2(ahead.x));

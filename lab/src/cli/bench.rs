@@ -202,7 +202,7 @@ impl BenchArguments {
 
     /// The running cell to be measured, if one is given.
     fn running_cell(&self) -> anyhow::Result<Option<Target>> {
-        let config = self
+        let loaded = self
             .config
             .as_deref()
             .map(NodeConfig::load_cell)
@@ -210,16 +210,16 @@ impl BenchArguments {
         let named = self
             .connect
             .clone()
-            .or_else(|| config.as_ref()?.mqtt.broker.clone());
+            .or_else(|| loaded.as_ref()?.mqtt.broker.clone());
         let Some(broker) = named else {
-            if config.is_some() {
+            if loaded.is_some() {
                 bail!(
                     "the configuration names no `mqtt.broker`: give --connect HOST:PORT, the aggregator's"
                 );
             }
             return Ok(None);
         };
-        let config = config.unwrap_or_default();
+        let config = loaded.unwrap_or_default();
         if !config.fusion.algorithms.pace() {
             bail!("the benchmark needs maps: set `fusion.algorithms` to `pace` or `both`");
         }

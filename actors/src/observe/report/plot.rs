@@ -47,13 +47,13 @@ impl Plot<'_> {
     pub(super) fn draw(&self) -> String {
         let points = || self.curves.iter().flat_map(|curve| &curve.points);
         let scale = Scale::new(self.x, points().map(|point| point.0));
-        let y_max = points()
+        let highest = points()
             .filter(|point| scale.shows(point.0))
             .map(|point| point.1)
             .fold(0.0, f64::max)
             .max(1e-9);
-        let y_step = step(y_max * 1.05);
-        let y_max = (y_max / y_step).ceil() * y_step;
+        let y_step = step(highest * 1.05);
+        let y_max = (highest / y_step).ceil() * y_step;
         let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * scale.share(value);
         let y = |value: f64| HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * value / y_max;
         let mut picture = picture(self.title, HEIGHT);

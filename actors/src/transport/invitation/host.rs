@@ -92,7 +92,7 @@ impl Host {
         let private = PrivateKeyDer::from(PrivatePkcs8KeyDer::from(key.serialize_der()));
         let chain = vec![CertificateDer::from(certificate.der().to_vec())];
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let tls = ServerConfig::builder_with_provider(provider)
+        let config = ServerConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&rustls::version::TLS13])
             .and_then(|builder| {
                 builder
@@ -100,7 +100,7 @@ impl Host {
                     .with_single_cert(chain, private)
             })
             .map_err(|error| AuthorityError::Crypto(error.to_string()))?;
-        let tls = TlsAcceptor::from(Arc::new(tls));
+        let tls = TlsAcceptor::from(Arc::new(config));
         Ok(Self {
             authority,
             cell_key,
