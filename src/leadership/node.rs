@@ -642,10 +642,11 @@ impl LeadershipNode {
         if self.is_vehicle_only || health == self.health {
             return;
         }
-        match (self.health.is_fit(), health.is_fit()) {
-            (false, true) => self.log(Notice::Fit),
-            (true, false) => self.log(Notice::Unfit { health }),
-            _ => {}
+        let was_fit = self.health.is_fit();
+        if health.is_fit() && !was_fit {
+            self.log(Notice::Fit);
+        } else if was_fit && !health.is_fit() {
+            self.log(Notice::Unfit { health });
         }
         self.health = health;
         self.feed(ElectionInput::Health { health }, now);
