@@ -205,7 +205,7 @@ impl RegionTown {
         let key = (topic.tile, topic.cell.clone());
         if !self.throttle.allow(&topic, now) {
             self.lose(
-                &key,
+                &topic,
                 CellLosses {
                     throttled: 1,
                     ..CellLosses::default()
@@ -231,8 +231,8 @@ impl RegionTown {
                 let age = self.filter.admit(&topic, &message, now)?.age;
                 self.counts.maps += 1;
                 let (map, losses) = TownMap::new(topic.tile, message, now - age);
-                self.cells.entry(key.clone()).or_default().map = Some(map);
-                self.lose(&key, losses);
+                self.cells.entry(key).or_default().map = Some(map);
+                self.lose(&topic, losses);
                 return Ok(Accepted::Map(topic, age));
             }
             RegionTopicKind::Cell => {
@@ -252,9 +252,10 @@ impl RegionTown {
     }
 
     /// Counts refused messages and objects, for its cell and for all.
-    fn lose(&mut self, key: &(Quadkey, NodeName), losses: CellLosses) {
+    fn lose(&mut self, topic: &RegionTopic, losses: CellLosses) {
         self.counts.losses.add(losses);
-        if let Some(cell) = self.cells.get_mut(key) {
+        let key = (topic.tile, topic.cell.clone());
+        if let Some(cell) = self.cells.get_mut(&key) {
             cell.losses.add(losses);
         }
     }
