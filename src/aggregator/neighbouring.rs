@@ -70,7 +70,8 @@ impl NeighbourView {
 /// True if two statements can refer to one object, considering the lower speed and their ages;
 /// `age_s` is the age of the second statement.
 fn is_near(other: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
-    let [a, b] = [&other.object, &stated.object];
+    let a = &other.object;
+    let b = &stated.object;
     let speeds = [a, b].map(|object| {
         object
             .velocity_mps

@@ -416,7 +416,9 @@ impl ToMap {
                 .unwrap_or(0.0)
         });
         let turned = self.turn * stated * self.turn.transpose();
-        let [xx, xy, yy] = [turned.m11, turned.m12, turned.m22];
+        let xx = turned.m11;
+        let xy = turned.m12;
+        let yy = turned.m22;
         (xx > 0.0 && yy > 0.0).then_some([xx, xy, yy])
     }
 }

@@ -124,12 +124,11 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
     let mut vehicle = NodeProcess::start(program, &vehicle_config, &directory)?;
     let door = serves(&mut vehicle).await?;
 
-    let [at_door, at_leader] = [
-        DoorWatcher::connect(door).await?,
-        DoorWatcher::connect(leader).await?,
-    ];
+    let at_door = DoorWatcher::connect(door).await?;
+    let at_leader = DoorWatcher::connect(leader).await?;
     at_door.first_map().await?;
-    let [mut report_at_door, mut report_at_leader] = [Latencies::default(), Latencies::default()];
+    let mut report_at_door = Latencies::default();
+    let mut report_at_leader = Latencies::default();
     for _ in 0..TURNS {
         let turn = duration / TURNS;
         report_at_leader.add(&report(leader, NODELESS, turn, &at_leader).await?);

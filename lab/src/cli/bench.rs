@@ -384,7 +384,8 @@ async fn saturate(
         let percent = |part: fn(AggregatorShares) -> f64| {
             watched.map_or("-".into(), |parts| format!("{:.0}", part(parts)))
         };
-        let [broker, fusion] = [percent(|parts| parts.broker), percent(|parts| parts.fusion)];
+        let broker = percent(|parts| parts.broker);
+        let fusion = percent(|parts| parts.fusion);
         print(&format!(
             "{:>8} {}    {} {missing:>9} {:>8} {:>8.1} {map_kb:>8.1} {verdict_kb:>11.1} {broker:>9} {fusion:>13} {:>11.0}\n",
             step.vehicles,

@@ -51,7 +51,10 @@ impl SceneRun<'_> {
             .iter()
             .map(|cav| (cav.name.clone(), unscored()))
             .collect();
-        let [mut score, mut paper, mut votes, mut answers] = [SpotScore::default(); 4];
+        let mut score = SpotScore::default();
+        let mut paper = SpotScore::default();
+        let mut votes = SpotScore::default();
+        let mut answers = SpotScore::default();
         for verdict in 0..self.verdicts {
             let steps =
                 verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();

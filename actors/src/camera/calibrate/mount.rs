@@ -244,7 +244,9 @@ fn sigmas(
             roll_rad: mount.roll_rad + change[2],
             ..*mount
         };
-        let [x_m, y_m, turn_rad] = [change[3], change[4], change[5]];
+        let x_m = change[3];
+        let y_m = change[4];
+        let turn_rad = change[5];
         let pose = Pose::new(
             pose.position.x + x_m,
             pose.position.y + y_m,

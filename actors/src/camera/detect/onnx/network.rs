@@ -107,7 +107,8 @@ impl Network {
                 taken.or(configured).map_or_else(said, Ok)?
             }
         };
-        let [height, width] = [size.height as usize, size.width as usize];
+        let height = size.height as usize;
+        let width = size.width as usize;
         let image_shape = if has_channels_last {
             [height, width, 3]
         } else {
