@@ -114,14 +114,14 @@ impl CellView {
 /// Draws the cell, and limits the scroll position to the last line.
 pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     // Two lines for each trouble, and the borders.
-    let told = if view.troubles.is_empty() {
+    let height = if view.troubles.is_empty() {
         0
     } else {
         2 + 2 * view.troubles.len().min(MAX_TROUBLES) as u16
     };
     let [head, wrong, places, below, foot] = Layout::vertical([
         Constraint::Length(4),
-        Constraint::Length(told),
+        Constraint::Length(height),
         Constraint::Min(5),
         Constraint::Length(9),
         Constraint::Length(1),

@@ -300,13 +300,13 @@ impl TownMap {
             ..
         } = map;
         let area = CoveredArea::of(tile);
-        let told = objects.len();
+        let stated = objects.len();
         objects.retain(|object| area.covers(&origin.to_wgs84(object.x_m, object.y_m, 0.0)));
         let covered = objects.len();
         objects.truncate(MAX_OBJECTS);
         let losses = CellLosses {
             throttled: 0,
-            outside: (told - covered) as u64,
+            outside: (stated - covered) as u64,
             too_many: (covered - objects.len()) as u64,
         };
         for object in &mut objects {

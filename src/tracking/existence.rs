@@ -5,7 +5,7 @@
 //! of its result under two hypotheses: the track is an object, or it is clutter. Observations of one vehicle are
 //! correlated: an occluder, or a structure that resembles an object, is still there a tenth of a second later. So the
 //! results of one vehicle are a Markov chain under both hypotheses, and the probability of a detection depends on the
-//! [previous results](LookState). All probabilities are estimated by vehicle. Between observations, an object may
+//! [previous results](ObservationState). All probabilities are estimated by vehicle. Between observations, an object may
 //! leave.
 //!
 //! Confidences are additional evidence. The confidences of one vehicle are correlated: n confidences with correlation ρ

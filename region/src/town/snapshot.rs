@@ -183,7 +183,7 @@ impl RegionTown {
             let state = cell.state(now, read_since);
             region.add(cell, state);
             known = Some(known.map_or(at, |known| known.with(at)));
-            if at.meets(bounds) {
+            if at.intersects(bounds) {
                 has_maps &= read_since.is_some();
                 shown.push((*tile, name, cell, state));
             }

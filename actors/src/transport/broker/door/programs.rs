@@ -326,8 +326,8 @@ impl DoorState {
         self.check_rate(kind, now)?;
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
-            let told = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
-            let text = format!("the report on {topic} is not usable: {reason}{told}; see docs/protocol.md#rejections");
+            let detail = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
+            let text = format!("the report on {topic} is not usable: {reason}{detail}; see docs/protocol.md#rejections");
             DoorRefusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
