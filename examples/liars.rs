@@ -44,13 +44,13 @@ const SERIES: [(&str, RGBColor); 4] = [
 const LANDMARKS: usize = 6;
 const ROUNDS: u64 = 600;
 const SETTLED: u64 = 300;
-const LIES: [Lie; 6] = [
-    Lie::Random,
-    Lie::Constant,
-    Lie::Copying,
-    Lie::Turning,
-    Lie::Rejoining,
-    Lie::Forging,
+const FAULTS: [Fault; 6] = [
+    Fault::Random,
+    Fault::Constant,
+    Fault::Copying,
+    Fault::Turning,
+    Fault::Rejoining,
+    Fault::Forging,
 ];
 /// Round before which the aggregator restarts, in runs with forged evidence.
 const RESTART: u64 = 150;
@@ -64,7 +64,7 @@ const HONEST_ACCURACY: f64 = 0.8;
 const PERIOD: Duration = Duration::from_millis(500);
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Lie {
+enum Fault {
     /// A wrong label at random.
     Random,
     /// Always the same label.
@@ -169,7 +169,7 @@ impl Cell {
         &mut self,
         round: u64,
         vehicles: usize,
-        liars: usize,
+        faulty: usize,
         now: Timestamp,
     ) -> Result<(), Box<dyn Error>> {
         if round == MISLED.start {
@@ -179,7 +179,7 @@ impl Cell {
             self.euclid.go_by(4, "edge", Position::Following)?;
         }
         for term in 1..=3 {
-            let share = forged(term, vehicles, liars)?;
+            let share = forged(term, vehicles, faulty)?;
             let merged = self.edge.merge(&share, now)?;
             let is_taken = self.euclid.merge(&share, now)?.is_news;
             if merged.is_news
@@ -220,15 +220,15 @@ fn signed(share: LedgerShare) -> LedgerShare {
 }
 
 /// Evidence of a leadership of the first malicious vehicle: all malicious vehicles are right and all others wrong.
-fn forged(term: u64, vehicles: usize, liars: usize) -> Result<LedgerShare, Box<dyn Error>> {
+fn forged(term: u64, vehicles: usize, faulty: usize) -> Result<LedgerShare, Box<dyn Error>> {
     let forger = NodeName::new("liar-0")?;
     let entry = |vehicle: usize, label: &str| {
-        let is_liar = vehicle < liars;
+        let is_faulty = vehicle < faulty;
         let node = NodeName::new(format!(
             "{}-{vehicle}",
-            if is_liar { "liar" } else { "honest" }
+            if is_faulty { "liar" } else { "honest" }
         ))?;
-        let (correct, incorrect) = if is_liar {
+        let (correct, incorrect) = if is_faulty {
             (1_000_000, 0)
         } else {
             (0, 1_000_000)
@@ -273,25 +273,25 @@ struct Course {
 }
 
 /// The courses of all seeds.
-struct Trial {
+struct Case {
     vehicles: usize,
-    lie: Lie,
+    fault: Fault,
     courses: Vec<Course>,
 }
 
-impl Trial {
+impl Case {
     fn mean(&self, of: impl Fn(&Course) -> f64) -> f64 {
         self.courses.iter().map(of).sum::<f64>() / self.courses.len().max(1) as f64
     }
 
-    fn liars(&self) -> usize {
+    fn faulty(&self) -> usize {
         (self.vehicles - 1) / 2
     }
 
-    fn lie_name(&self) -> String {
-        match self.lie {
-            Lie::Forging => "forges evidence".into(),
-            lie => format!("{lie:?}").to_lowercase(),
+    fn fault_name(&self) -> String {
+        match self.fault {
+            Fault::Forging => "forges evidence".into(),
+            fault => format!("{fault:?}").to_lowercase(),
         }
     }
 
@@ -299,8 +299,8 @@ impl Trial {
     fn name(&self) -> String {
         format!(
             "{}, {} of {} lie",
-            self.lie_name(),
-            self.liars(),
+            self.fault_name(),
+            self.faulty(),
             self.vehicles
         )
     }
@@ -333,8 +333,8 @@ impl Trial {
         format!(
             "| {} | {} | {} | {:.1} | {:.1} | {:.1} | {worst:.1} | {:.2} | {:.2} |\n",
             self.vehicles,
-            self.liars(),
-            self.lie_name(),
+            self.faulty(),
+            self.fault_name(),
             self.mean(|c| c.majority),
             self.mean(|c| c.honest),
             self.mean(|c| c.settled),
@@ -359,9 +359,9 @@ fn chance_of_most(votes: &[usize], truth: usize) -> f64 {
     }
 }
 
-fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
+fn run(vehicles: usize, fault: Fault, seed: u64) -> Result<Course, Box<dyn Error>> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let liars = (vehicles - 1) / 2;
+    let faulty = (vehicles - 1) / 2;
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     let mut course = Course {
         accuracy: Vec::new(),
@@ -380,11 +380,11 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let mut cell = Cell::new()?;
     for round in 0..ROUNDS {
         now = now + PERIOD;
-        if lie == Lie::Forging {
+        if fault == Fault::Forging {
             if round == RESTART {
                 vote = Vote::new(VoteConfig::default(), Vec::new());
             }
-            cell.forge(round, vehicles, liars, now)?;
+            cell.forge(round, vehicles, faulty, now)?;
             if round == RESTART {
                 vote.adopt(&cell.edge.ledger);
             }
@@ -400,30 +400,32 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         let mut said = vec![[0usize; LABELS.len()]; LANDMARKS];
         let mut said_honestly = said.clone();
         for vehicle in 0..vehicles {
-            let lies = vehicle < liars && !(lie == Lie::Turning && round < ROUNDS / 3);
-            let name = match lie {
-                Lie::Rejoining if lies => format!("liar-{vehicle}-{}", round / 10),
+            let is_false = vehicle < faulty && !(fault == Fault::Turning && round < ROUNDS / 3);
+            let name = match fault {
+                Fault::Rejoining if is_false => format!("liar-{vehicle}-{}", round / 10),
                 _ => format!(
                     "{}-{vehicle}",
-                    if vehicle < liars { "liar" } else { "honest" }
+                    if vehicle < faulty { "liar" } else { "honest" }
                 ),
             };
             let mut objects = Vec::new();
             for (place, &truth) in truths.iter().enumerate() {
-                let label = match lie {
-                    _ if !lies => {
+                let label = match fault {
+                    _ if !is_false => {
                         if rng.random_bool(HONEST_ACCURACY) {
                             truth
                         } else {
                             other(&mut rng, truth)
                         }
                     }
-                    Lie::Random => other(&mut rng, truth),
-                    Lie::Constant => 0,
-                    Lie::Copying | Lie::Turning | Lie::Rejoining | Lie::Forging => common[place],
+                    Fault::Random => other(&mut rng, truth),
+                    Fault::Constant => 0,
+                    Fault::Copying | Fault::Turning | Fault::Rejoining | Fault::Forging => {
+                        common[place]
+                    }
                 };
                 said[place][label] += 1;
-                said_honestly[place][label] += usize::from(vehicle >= liars);
+                said_honestly[place][label] += usize::from(vehicle >= faulty);
                 objects.push(PerceivedObject {
                     landmark: Some(format!("place-{place}").into()),
                     ..PerceivedObject::new(LABELS[label], 0.8, 0.0, 0.0)
@@ -485,7 +487,7 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
 }
 
 /// A column for each number of vehicles, a row for each attack.
-fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
+fn draw(path: &str, cases: &[Case]) -> Result<(), Box<dyn Error>> {
     let columns = SIZES.len();
     let area = SVGBackend::new(path, (320 * columns as u32, 1200)).into_drawing_area();
     area.fill(&WHITE)?;
@@ -500,17 +502,17 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
         x += 270;
     }
     for (place, area) in panels
-        .split_evenly((LIES.len(), columns))
+        .split_evenly((FAULTS.len(), columns))
         .iter()
         .enumerate()
     {
-        let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else {
+        let Some(case) = cases.get(place % columns * FAULTS.len() + place / columns) else {
             continue;
         };
         let mut chart = ChartBuilder::on(area)
             .margin(8)
             .margin_right(24)
-            .caption(trial.name(), ("sans-serif", 17))
+            .caption(case.name(), ("sans-serif", 17))
             .x_label_area_size(36)
             .y_label_area_size(36)
             .build_cartesian_2d(0.0..ROUNDS as f64, 0.0..1.04)?;
@@ -526,7 +528,7 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
             .draw()?;
         let course = |of: fn(&Course, usize) -> f64| {
             (0..(ROUNDS / 10) as usize)
-                .map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
+                .map(move |n| (n as f64 * 10.0 + 10.0, case.mean(|c| of(c, n))))
         };
         let courses: [fn(&Course, usize) -> f64; SERIES.len()] = [
             |c, n| c.accuracy[n].1,
@@ -574,22 +576,22 @@ fn main() -> Result<(), Box<dyn Error>> {
          |---|---|---|---|---|---|---|---|---|\n";
     let mut table = header.to_owned();
     let mut shown = header.to_owned();
-    let mut trials = Vec::new();
+    let mut cases = Vec::new();
     for vehicles in SIZES {
-        for lie in LIES {
+        for fault in FAULTS {
             let courses = (1..=seeds)
-                .map(|seed| run(vehicles, lie, seed))
+                .map(|seed| run(vehicles, fault, seed))
                 .collect::<Result<_, _>>()?;
-            let trial = Trial {
+            let case = Case {
                 vehicles,
-                lie,
+                fault,
                 courses,
             };
-            table.push_str(&trial.row());
+            table.push_str(&case.row());
             if SHOWN_SIZES.contains(&vehicles) {
-                shown.push_str(&trial.row());
+                shown.push_str(&case.row());
             }
-            trials.push(trial);
+            cases.push(case);
         }
     }
     print!("{table}");
@@ -600,9 +602,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         write_table(&path, &shown)?;
     }
     if let Some(path) = svg {
-        draw(&path, &trials)?;
+        draw(&path, &cases)?;
     }
-    let flaws: Vec<_> = trials.iter().filter_map(Trial::flaw).collect();
+    let flaws: Vec<_> = cases.iter().filter_map(Case::flaw).collect();
     if flaws.is_empty() {
         Ok(())
     } else {

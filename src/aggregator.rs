@@ -350,9 +350,9 @@ impl Aggregator {
     }
 
     /// True if there is a landmark with this id; `None` if there are no landmarks at all.
-    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+    pub fn has_location(&self, id: &LandmarkId) -> Option<bool> {
         let Some(pace) = &self.pace else {
-            return self.vote.as_ref()?.knows_location(id);
+            return self.vote.as_ref()?.has_location(id);
         };
         let landmarks = pace.landmarks();
         (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())

@@ -110,15 +110,21 @@ fn solve<C: Candidate>(
         ));
     }
     let rows = row_of.len();
-    let columns = column_of.len();
-    if let Some(settled) = limit(ClusterSize { rows, columns }, cluster) {
+    let real_columns = column_of.len();
+    if let Some(settled) = limit(
+        ClusterSize {
+            rows,
+            columns: real_columns,
+        },
+        cluster,
+    ) {
         assigned.extend(settled);
         return;
     }
     let columns = if C::SPARE_COLUMNS {
-        columns + rows
+        real_columns + rows
     } else {
-        columns
+        real_columns
     };
     // The algorithm requires at least as many columns as rows.
     if rows > columns {

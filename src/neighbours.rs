@@ -128,7 +128,7 @@ impl Neighbours {
         if message.cell == self.cell {
             return Err(RejectReason::NodeMismatch);
         }
-        self.forget_silent(received_at);
+        self.drop_silent(received_at);
         let AdmittedMap { age } = self.filter.admit(topic, &message, received_at)?;
         let CellMap {
             cell, origin, map, ..
@@ -196,7 +196,7 @@ impl Neighbours {
 
     /// The objects of other cells near this cell, each cell's nearest first, as in their maps.
     pub fn near(&mut self, now: Timestamp) -> Vec<NeighbourObject> {
-        self.forget_silent(now);
+        self.drop_silent(now);
         let of_cell = |(cell, map): (&NodeName, &NeighbourMap)| {
             let cell = cell.clone();
             let age_s = now.since(map.fused_at).as_secs_f64();
@@ -216,11 +216,11 @@ impl Neighbours {
         &self.losses
     }
 
-    fn forget_silent(&mut self, now: Timestamp) {
+    fn drop_silent(&mut self, now: Timestamp) {
         self.cells
             .retain(|_, map| now.since(map.fused_at) <= MAX_AGE);
-        self.filter.forget_silent(now);
+        self.filter.drop_silent(now);
         let filter = &self.filter;
-        self.losses.retain(|cell, _| filter.knows(cell));
+        self.losses.retain(|cell, _| filter.has_cell(cell));
     }
 }

@@ -184,7 +184,7 @@ impl Vote {
 
     /// True if a location of this id is listed; `None` without a list, where reports name the
     /// locations.
-    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+    pub fn has_location(&self, id: &LandmarkId) -> Option<bool> {
         (!self.open).then(|| self.landmarks.contains_key(id))
     }
 
@@ -353,14 +353,14 @@ impl Vote {
             range_bearing,
             at,
         };
-        let Some(forgotten) = self
+        let Some(dropped) = self
             .method
             .get_mut()
             .make_room_for(&vote, self.config.max_labels)
         else {
             return false;
         };
-        self.ignored += forgotten as u64;
+        self.ignored += dropped as u64;
         if !self.landmarks.contains_key(id) {
             self.open_landmark(id, &report.node);
         }

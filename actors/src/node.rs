@@ -87,7 +87,7 @@ pub enum NodeMessage {
         description: Arc<CellDescription>,
     },
     /// Record the readiness of the node.
-    NoteReadiness {
+    RecordReadiness {
         /// Readiness for its task.
         readiness: Readiness,
     },
@@ -385,7 +385,7 @@ impl Actor for Supervisor {
                 // A caller that has stopped waiting needs no answer.
                 let _ = done.send(());
             }
-            NodeMessage::NoteReadiness { mut readiness } => {
+            NodeMessage::RecordReadiness { mut readiness } => {
                 // Between two cells there is no leader, and a restart would begin in the home cell.
                 readiness.needs_restart &= !state.builder.moves_on();
                 if let Some(manager) = &mut state.manager {
@@ -477,7 +477,7 @@ async fn watch_readiness(vitals: Vitals, period: Duration, supervisor: ActorRef<
         ticks.tick().await;
         let readiness = vitals.readiness(&vitals.probe().await);
         if supervisor
-            .cast(NodeMessage::NoteReadiness { readiness })
+            .cast(NodeMessage::RecordReadiness { readiness })
             .is_err()
         {
             break;

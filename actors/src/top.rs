@@ -114,14 +114,14 @@ impl CellView {
 /// Draws the cell, and limits the scroll position to the last line.
 pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     // Two lines for each trouble, and the borders.
-    let told = if view.troubles.is_empty() {
+    let height = if view.troubles.is_empty() {
         0
     } else {
         2 + 2 * view.troubles.len().min(MAX_TROUBLES) as u16
     };
     let [head, wrong, places, below, foot] = Layout::vertical([
         Constraint::Length(4),
-        Constraint::Length(told),
+        Constraint::Length(height),
         Constraint::Min(5),
         Constraint::Length(9),
         Constraint::Length(1),
@@ -177,17 +177,17 @@ fn summary(view: &CellView) -> Paragraph<'_> {
         Some(age) => Span::from(format!("newest round {} ms old", age.as_millis())).green(),
         None => Span::from("no round yet").yellow(),
     };
-    let before: Vec<_> = view
+    let epochs: Vec<_> = view
         .history
         .iter()
         .rev()
         .skip(1)
         .map(|(epoch, _)| epoch.to_string())
         .collect();
-    let before = if before.is_empty() {
+    let before = if epochs.is_empty() {
         String::new()
     } else {
-        format!("  before: {}", before.join(", "))
+        format!("  before: {}", epochs.join(", "))
     };
     let lines = vec![
         Line::from(vec![leader, "  ".into(), freshness]),

@@ -95,7 +95,7 @@ fn main() -> anyhow::Result<()> {
         None
     };
     let kitti = find(kitti::DETECTIONS).zip(find(kitti::TRUTH));
-    let wildtrack = find(wildtrack::BOXES)
+    let wildtrack_files = find(wildtrack::BOXES)
         .zip(find(wildtrack::CAMERAS))
         .zip(find(wildtrack::TRUTH));
     for set in LABEL_SETS {
@@ -103,7 +103,7 @@ fn main() -> anyhow::Result<()> {
         find((path.as_str(), LABELS.1));
     }
     missing.iter().for_each(|what| eprintln!("{what}"));
-    let wildtrack = wildtrack
+    let wildtrack = wildtrack_files
         .map(|((boxes, cameras), truth)| Wildtrack::read(&boxes, &cameras, &truth))
         .transpose()?;
     if let Some(wildtrack) = &wildtrack {
@@ -221,18 +221,18 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
     let share = |value: &Value| figure(value, 1);
     let at = &tracks["at_best_f1"];
     let calibration = &tracks["calibration"];
-    let mut cells: Vec<Option<String>> = (0..4)
+    let mut shares: Vec<Option<String>> = (0..4)
         .map(|place| share(&tracks["ap_pct"][place]))
         .collect();
-    cells.extend((0..3).map(|place| share(&tracks["best_moda_pct"][place])));
-    cells.push(share(&tracks["best_f1_pct"]));
-    cells.extend([&at["motp_m"], &at["threshold"]].map(|value| figure(value, 2)));
-    cells.extend(["confidence", "existence"].map(|kind| share(&calibration[kind]["ece_pct"])));
+    shares.extend((0..3).map(|place| share(&tracks["best_moda_pct"][place])));
+    shares.push(share(&tracks["best_f1_pct"]));
+    shares.extend([&at["motp_m"], &at["threshold"]].map(|value| figure(value, 2)));
+    shares.extend(["confidence", "existence"].map(|kind| share(&calibration[kind]["ece_pct"])));
     let counts = format!("{}, {}", at["id_switches"], at["fragments"]);
     let identities = [share(&at["hota_pct"]), share(&at["idf1_pct"]), Some(counts)];
     let is_judged = is_tracked && !at["idf1_pct"].is_null();
-    cells.extend(identities.map(|figure| figure.filter(|_| is_judged)));
-    let cells: Vec<String> = cells
+    shares.extend(identities.map(|figure| figure.filter(|_| is_judged)));
+    let cells: Vec<String> = shares
         .into_iter()
         .map(|cell| cell.unwrap_or_else(|| "-".to_owned()))
         .collect();

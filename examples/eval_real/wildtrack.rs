@@ -163,8 +163,8 @@ impl Wildtrack {
         let alone = (1..)
             .zip(alone)
             .map(|(camera, lines)| (format!("camera {camera}"), lines));
-        let others = [("detections".to_owned(), all)].into_iter().chain(alone);
-        let others = others
+        let methods = [("detections".to_owned(), all)].into_iter().chain(alone);
+        let others = methods
             .chain([("late fusion".to_owned(), late_fusion)])
             .map(|(method, lines)| {
                 let path = work.join(format!("{method}.txt"));

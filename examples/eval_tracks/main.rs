@@ -29,7 +29,7 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
 use ecod_lab::eval::baselines::{LatestReports, NearestTracker, found, suppressed};
 use ecod_lab::eval::tracks::{
-    AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth,
+    AP_DISTANCES_M, ReliabilityBins, ReportedObject, TrackEvaluation, TrackScores, TrackTruth,
 };
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
@@ -176,7 +176,7 @@ impl Scene {
 fn run(
     recording: &TrafficRecording,
     observers: usize,
-    write: &mut dyn FnMut(Timestamp, &[SaidObject]),
+    write: &mut dyn FnMut(Timestamp, &[ReportedObject]),
 ) -> anyhow::Result<[TrackScores; METHODS.len()]> {
     let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
     let judge = || TrackEvaluation::new(truth.clone());
@@ -190,10 +190,10 @@ fn run(
         Event::Report(report) => latest.report(report),
         Event::Due(at) => {
             let all = latest.union(at);
-            union.said(at, &union_tracker.track(at, &all));
+            union.add_objects(at, &union_tracker.track(at, &all));
             let suppressed = late_tracker.track(at, &suppressed(all));
             write(at, &suppressed);
-            late.said(at, &suppressed);
+            late.add_objects(at, &suppressed);
         }
     }) {
         ours.map(&map);
@@ -282,7 +282,7 @@ fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluati
         .collect();
     own.sort_by_key(|report| report.captured_at_us);
     for report in own {
-        judge.said(
+        judge.add_objects(
             report.captured_at_us,
             &tracker.track(report.captured_at_us, &found(report)),
         );
@@ -344,7 +344,7 @@ impl Files {
         })
     }
 
-    fn map(&mut self, at: Timestamp, said: &[SaidObject]) -> anyhow::Result<()> {
+    fn map(&mut self, at: Timestamp, said: &[ReportedObject]) -> anyhow::Result<()> {
         let objects = said.iter().map(|said| {
             let id = Uuid::from_u128(u128::from(said.id));
             let covariance = Covariance::isotropic(1.0);
@@ -409,7 +409,7 @@ fn main() -> anyhow::Result<()> {
                 .map(|folder| Files::new(folder, &format!("{name}-{seed}"), &recording))
                 .transpose()?;
             let mut written = Ok(());
-            let mut write = |at, said: &[SaidObject]| {
+            let mut write = |at, said: &[ReportedObject]| {
                 if let (Some(files), Ok(())) = (&mut files, &written) {
                     written = files.map(at, said);
                 }

@@ -112,7 +112,7 @@ impl Cell {
         let Some((node, _)) = self.nodes.values().next() else {
             return Default::default();
         };
-        let map = node
+        let newest = node
             .newest_map()
             .borrow()
             .as_ref()
@@ -122,7 +122,7 @@ impl Cell {
             .borrow()
             .as_ref()
             .map(|newest| Arc::clone(&newest.message));
-        let map = map
+        let map = newest
             .iter()
             .flat_map(|map| &map.landmarks)
             .map(|place| match &place.label {

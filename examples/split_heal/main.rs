@@ -50,13 +50,13 @@ fn main() -> anyhow::Result<()> {
     );
     cell.split(false, "the vehicles start")?;
     cell.run_for(7700)?;
-    cell.tell("all is well");
+    cell.print_event("all is well");
     cell.split(true, "the network splits")?;
     cell.run_for(7700)?;
-    cell.tell("both sides go on");
+    cell.print_event("both sides go on");
     cell.split(false, "the network heals")?;
     cell.run_for(7700)?;
-    cell.tell("all is well");
+    cell.print_event("all is well");
     cell.check()
 }
 
@@ -101,7 +101,7 @@ impl Cell {
     /// Cuts or restores the links between the halves; the memberships report it later.
     fn split(&mut self, is_split: bool, event: &str) -> anyhow::Result<()> {
         self.is_split = is_split;
-        self.tell(event);
+        self.print_event(event);
         self.run_for(NOTICE_MS)?;
         for node in 0..SEEN.len() {
             for other in (0..SEEN.len()).filter(|other| *other != node) {
@@ -156,12 +156,12 @@ impl Cell {
             }
         }
         for event in std::mem::take(&mut self.vehicles[from].news) {
-            self.tell(&event);
+            self.print_event(&event);
         }
     }
 
     /// Prints an event and the map of each half.
-    fn tell(&self, event: &str) {
+    fn print_event(&self, event: &str) {
         let view = |vehicle: &Vehicle| {
             let Some(map) = &vehicle.map else {
                 return "none".to_owned();
@@ -196,7 +196,7 @@ impl Cell {
             .flat_map(|vehicle| &vehicle.settled)
             .collect();
         for (epoch, settled) in settled {
-            let held = |vehicle: &Vehicle| {
+            let held_by = |vehicle: &Vehicle| {
                 let lane = vehicle
                     .ledger
                     .entries()
@@ -204,7 +204,7 @@ impl Cell {
                 lane.map(|entry| entry.correct + entry.incorrect)
                     .sum::<u64>()
             };
-            let held: Vec<_> = self.vehicles.iter().map(held).collect();
+            let held: Vec<_> = self.vehicles.iter().map(held_by).collect();
             println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
             ensure!(*settled > 0, "{epoch} settled no votes");
             ensure!(

@@ -311,9 +311,9 @@ impl Vehicle {
                 self.aggregator.step_down();
             }
             Effect::SendSnapshot { .. } => self.share(&self.resync.snapshot(&self.ledger)),
-            Effect::Look => {
+            Effect::Observe => {
                 let members = self.members.values().cloned().collect();
-                return Some(Input::Looked {
+                return Some(Input::Observed {
                     rounds_due: self.rounds_due,
                     load_percent: 0,
                     members,

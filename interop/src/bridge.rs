@@ -93,13 +93,13 @@ impl CpmBridge {
             part: "cpm".to_owned(),
             ..settings.clone()
         })?;
-        let described = described(&cell)?.ok_or_else(|| {
+        let description = described(&cell)?.ok_or_else(|| {
             Error::Invalid(format!(
                 "the description of the cell {name} has no [origin], and a CPM needs a reference position on Earth: add \
                  latitude_deg and longitude_deg (docs/configuration.md#origin) and set it with `ecod-node cell set`"
             ))
         })?;
-        let described = Mutex::new((Instant::now(), Arc::new(described)));
+        let described = Mutex::new((Instant::now(), Arc::new(description)));
         let numbers = Mutex::new(StationIds::new(name));
         let sightings = Mutex::default();
         let refusals = RefusalCounts::default();

@@ -67,8 +67,8 @@ impl<K: Clone + Ord> RefusalCounts<K> {
         let kind = if has_room { kind } else { rest };
         let count = counts.entry(kind.clone()).or_default();
         *count += 1;
-        let is_told = 10u64.pow(count.ilog10()) == *count;
-        is_told.then_some((kind, *count))
+        let is_reported = 10u64.pow(count.ilog10()) == *count;
+        is_reported.then_some((kind, *count))
     }
 
     pub(crate) fn counts(&self) -> BTreeMap<K, u64> {

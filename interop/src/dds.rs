@@ -142,7 +142,7 @@ pub struct RosBridge {
 struct DetectorInput {
     topic: String,
     kind: &'static str,
-    heard: Arc<AtomicBool>,
+    has_received: Arc<AtomicBool>,
 }
 
 /// A message of a detector.
@@ -356,14 +356,14 @@ impl RosBridge {
         let reader: DataReader<M> = subscriber
             .create_datareader_no_key_cdr(&topic, Some(qos))
             .map_err(RosBridgeError::dds)?;
-        let heard = Arc::new(AtomicBool::new(false));
+        let has_received = Arc::new(AtomicBool::new(false));
         lock(&self.inputs).push(DetectorInput {
             topic: name.to_owned(),
             kind: M::NAME,
-            heard: Arc::clone(&heard),
+            has_received: Arc::clone(&has_received),
         });
         let samples = reader.async_sample_stream().filter_map(move |sample| {
-            heard.store(true, Ordering::Relaxed);
+            has_received.store(true, Ordering::Relaxed);
             let taken = match sample {
                 Ok(sample) => Some(taken(sample.into_value())),
                 Err(error) => {
@@ -378,8 +378,13 @@ impl RosBridge {
 
     /// Logs the topics on which no message has arrived.
     fn report_silence(&self) {
-        for DetectorInput { topic, kind, heard } in lock(&self.inputs).iter() {
-            if !heard.load(Ordering::Relaxed) {
+        for DetectorInput {
+            topic,
+            kind,
+            has_received,
+        } in lock(&self.inputs).iter()
+        {
+            if !has_received.load(Ordering::Relaxed) {
                 log::warn!(
                     "no message on {topic} in {PATIENCE:?}: check topic, type ({kind}), domain and network of the publisher"
                 );

@@ -287,7 +287,7 @@ impl Tally {
             let said = self
                 .last
                 .get(&(id.clone(), number))
-                .and_then(|last| last.said(truth, span));
+                .and_then(|last| last.label_in(truth, span));
             let is_right = u64::from(truth.accepts(span, said));
             items += 1;
             right += is_right;
@@ -335,7 +335,7 @@ impl Tally {
 }
 
 impl Last {
-    fn said(&self, truth: &Truth, span: &LabelSpan) -> Option<&Label> {
+    fn label_in(&self, truth: &Truth, span: &LabelSpan) -> Option<&Label> {
         if truth.accepts(span, None) {
             self.entry.as_ref()
         } else {

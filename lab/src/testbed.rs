@@ -11,13 +11,13 @@ mod file;
 pub mod frames;
 pub mod intersection;
 mod recording;
+pub mod scene_run;
 pub mod score;
 pub mod setup;
 mod sight;
 pub mod table;
 #[cfg(test)]
 mod tests;
-pub mod trial;
 
 use std::time::Duration;
 

@@ -25,7 +25,9 @@ use hashbrown::HashMap;
 use nalgebra::Point2;
 use uuid::Uuid;
 
-use crate::eval::tracks::{SaidObject, TrackEvaluation, TrackScores, TrackTruth, TrackTruthError};
+use crate::eval::tracks::{
+    ReportedObject, TrackEvaluation, TrackScores, TrackTruth, TrackTruthError,
+};
 use crate::traffic::{TrafficConfig, TrafficRecording, TrafficTruth, TruthFrame};
 use cell::TownCell;
 use links::TownLinks;
@@ -380,12 +382,12 @@ fn judge(
         let mut ids = HashMap::new();
         for frame in &truth.frames {
             let moment = moment(cells, frame.t_us);
-            let said: Vec<SaidObject> = moment
+            let said: Vec<ReportedObject> = moment
                 .iter()
                 .filter(|object| is_part(&Point2::new(object.x_m, object.y_m)))
-                .map(|object| SaidObject::of(object, &mut ids))
+                .map(|object| ReportedObject::of(object, &mut ids))
                 .collect();
-            judge.said(frame.t_us, &said);
+            judge.add_objects(frame.t_us, &said);
         }
         Ok(judge.result())
     };

@@ -34,7 +34,7 @@ use ecod::wire::ObjectReport;
 use nalgebra::Point2;
 use serde::Serialize;
 
-pub use config::{SaidConfig, SensorConfig, TrafficConfig};
+pub use config::{ReportedFields, SensorConfig, TrafficConfig};
 
 use dice::Dice;
 use drive::MovingVehicle;

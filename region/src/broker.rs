@@ -84,12 +84,12 @@ impl BrokerLogin {
     /// Options of a connection. The client id is random, because a client with the same id could
     /// end this connection.
     pub fn options(&self) -> MqttOptions {
-        let host = self.address.host();
+        let stated_host = self.address.host();
         // The name in the certificate has no brackets.
         let host = if self.tls.is_some() {
-            host.trim_matches(['[', ']'])
+            stated_host.trim_matches(['[', ']'])
         } else {
-            host
+            stated_host
         };
         let id = format!("ecod-region-{}", Uuid::new_v4().simple());
         let mut options = MqttOptions::new(id, host, self.address.port());

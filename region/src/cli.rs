@@ -55,10 +55,8 @@ fn run_until_stopped<T>(
 ) -> Result<Option<T>, Failure> {
     let runtime = Runtime::new().context("cannot start threads")?;
     let outcome = runtime.block_on(async {
-        let [mut interrupted, mut terminated] = [
-            signal(SignalKind::interrupt())?,
-            signal(SignalKind::terminate())?,
-        ];
+        let mut interrupted = signal(SignalKind::interrupt())?;
+        let mut terminated = signal(SignalKind::terminate())?;
         tokio::select! {
             outcome = future => outcome.map(Some),
             _ = interrupted.recv() => Ok(None),

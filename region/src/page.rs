@@ -89,7 +89,7 @@ async fn upkeep(api: &RegionApi) {
     loop {
         let now: Timestamp = clock::now();
         api.ask(now);
-        api.state.town().forget_old_maps(now);
+        api.state.town().drop_old_maps(now);
         tokio::time::sleep(UPKEEP_PERIOD).await;
     }
 }

@@ -123,7 +123,7 @@ pub enum CellState {
     Live,
     /// Its status claims a leader, but its maps are not read, or not for long enough for a
     /// conclusion.
-    Told,
+    Claimed,
     /// Its status claims a leader, but no map arrives although one is due.
     Silent,
     /// Its status is offline.
@@ -132,13 +132,13 @@ pub enum CellState {
 
 impl CellState {
     /// All states in order of declaration.
-    pub const ALL: [Self; 4] = [Self::Live, Self::Told, Self::Silent, Self::Offline];
+    pub const ALL: [Self; 4] = [Self::Live, Self::Claimed, Self::Silent, Self::Offline];
 
     /// The state in metrics and on the page.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Live => "live",
-            Self::Told => "told",
+            Self::Claimed => "told",
             Self::Silent => "silent",
             Self::Offline => "offline",
         }
@@ -208,7 +208,7 @@ impl RegionTown {
         let key = (topic.tile, topic.cell.clone());
         if !self.throttle.allow(&topic, now) {
             self.lose(
-                &key,
+                &topic,
                 CellLosses {
                     throttled: 1,
                     ..CellLosses::default()
@@ -234,8 +234,8 @@ impl RegionTown {
                 let age = self.filter.admit(&topic, &message, now)?.age;
                 self.counts.maps += 1;
                 let (map, losses) = TownMap::new(topic.tile, message, now - age);
-                self.cells.entry(key.clone()).or_default().map = Some(map);
-                self.lose(&key, losses);
+                self.cells.entry(key).or_default().map = Some(map);
+                self.lose(&topic, losses);
                 return Ok(Accepted::Map(topic, age));
             }
             RegionTopicKind::Cell => {
@@ -255,9 +255,10 @@ impl RegionTown {
     }
 
     /// Counts refused messages and objects, for its cell and for all.
-    fn lose(&mut self, key: &(Quadkey, NodeName), losses: CellLosses) {
+    fn lose(&mut self, topic: &RegionTopic, losses: CellLosses) {
         self.counts.losses.add(losses);
-        if let Some(cell) = self.cells.get_mut(key) {
+        let key = (topic.tile, topic.cell.clone());
+        if let Some(cell) = self.cells.get_mut(&key) {
             cell.losses.add(losses);
         }
     }
@@ -273,8 +274,8 @@ impl RegionTown {
     }
 
     /// Drops outdated maps, for example of tiles that are out of view.
-    pub fn forget_old_maps(&mut self, now: Timestamp) {
-        self.filter.forget_silent(now);
+    pub fn drop_old_maps(&mut self, now: Timestamp) {
+        self.filter.drop_silent(now);
         for cell in self.cells.values_mut() {
             cell.map = cell
                 .map
@@ -302,13 +303,13 @@ impl TownMap {
             ..
         } = map;
         let area = CoveredArea::of(tile);
-        let told = objects.len();
+        let stated = objects.len();
         objects.retain(|object| area.covers(&origin.to_wgs84(object.x_m, object.y_m, 0.0)));
         let covered = objects.len();
         objects.truncate(MAX_OBJECTS);
         let losses = CellLosses {
             throttled: 0,
-            outside: (told - covered) as u64,
+            outside: (stated - covered) as u64,
             too_many: (covered - objects.len()) as u64,
         };
         for object in &mut objects {
@@ -351,7 +352,7 @@ impl RegionCell {
             {
                 CellState::Silent
             }
-            _ => CellState::Told,
+            _ => CellState::Claimed,
         }
     }
 }

@@ -48,12 +48,12 @@ impl NeighbourView {
             let age_s = stated.age_s + passed_s;
             let is_hidden =
                 age_s > MAX_AGE.as_secs_f64() || tracks.is_some_and(|tracks| tracks.hides(stated));
-            let is_told = || {
-                shown
-                    .iter()
-                    .any(|told| told.object.id == stated.object.id && is_near(told, stated, age_s))
+            let is_stated = || {
+                shown.iter().any(|other| {
+                    other.object.id == stated.object.id && is_near(other, stated, age_s)
+                })
             };
-            if !is_hidden && !known.contains(&stated.object.id) && !is_told() {
+            if !is_hidden && !known.contains(&stated.object.id) && !is_stated() {
                 shown.push(NeighbourObject {
                     age_s,
                     ..stated.clone()
@@ -69,8 +69,9 @@ impl NeighbourView {
 
 /// True if two statements can refer to one object, considering the lower speed and their ages;
 /// `age_s` is the age of the second statement.
-fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
-    let [a, b] = [&told.object, &stated.object];
+fn is_near(other: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
+    let a = &other.object;
+    let b = &stated.object;
     let speeds = [a, b].map(|object| {
         object
             .velocity_mps
@@ -78,5 +79,5 @@ fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool
     });
     let speed_mps = f64::min(speeds[0], speeds[1]);
     (a.x_m - b.x_m).hypot(a.y_m - b.y_m)
-        <= SAME_PLACE_M + speed_mps * ((told.age_s - age_s).abs() + CLOCK_ERROR_S)
+        <= SAME_PLACE_M + speed_mps * ((other.age_s - age_s).abs() + CLOCK_ERROR_S)
 }

@@ -424,7 +424,8 @@ fn settled_votes_become_adopted_evidence() {
 fn settled(
     cell: &mut Aggregator,
     nodes: &[&str],
-    (from_ms, until_ms): (u64, u64),
+    from_ms: u64,
+    until_ms: u64,
 ) -> BTreeMap<NodeName, usize> {
     let mut settled = BTreeMap::new();
     for step in (from_ms / 100)..(until_ms / 100 + 30) {
@@ -470,8 +471,8 @@ fn open_votes_settle_on_one_side() {
     );
     // Both vehicles lose the standby, and one of them also the edge: each has voted for less than
     // two seconds.
-    let at_the_edge = settled(&mut edge, &["euclid"], (1000, 1500));
-    let at_the_standby = settled(&mut standby, &[], (1000, 1500));
+    let at_the_edge = settled(&mut edge, &["euclid"], 1000, 1500);
+    let at_the_standby = settled(&mut standby, &[], 1000, 1500);
     assert_eq!(
         at_the_edge.values().copied().collect::<Vec<_>>(),
         [1, 1],
@@ -483,7 +484,7 @@ fn open_votes_settle_on_one_side() {
 #[test]
 fn new_leader_counts_later_votes() {
     let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
-    let before = settled(&mut standby, &["euclid", "gauss"], (100, 1000));
+    let before = settled(&mut standby, &["euclid", "gauss"], 100, 1000);
     assert!(before.is_empty());
     standby.lead(
         Epoch::new(4, NodeName::from_static("standby")),
@@ -491,7 +492,7 @@ fn new_leader_counts_later_votes() {
         FirstRound::Overdue,
         at(5000),
     );
-    let after = settled(&mut standby, &["euclid", "gauss"], (5000, 6000));
+    let after = settled(&mut standby, &["euclid", "gauss"], 5000, 6000);
     assert_eq!(
         after.values().copied().collect::<Vec<_>>(),
         [1, 1],

@@ -15,7 +15,7 @@
 //! - A follower's stamps don't depend on its own wall clock, so a step of that clock does no harm.
 //!
 //! Call [`CellTime::stamps`] for every message sent, [`CellTime::receive`] and then
-//! [`CellTime::follow`] for every message received, and [`CellTime::look`] periodically.
+//! [`CellTime::follow`] for every message received, and [`CellTime::read_wall`] periodically.
 //! [`CellTime::reading`] returns the result.
 
 mod offset_filter;
@@ -74,11 +74,11 @@ pub struct WrongClock<'a> {
 pub struct CellTime {
     /// True if the node's own wall clock counts.
     is_candidate: bool,
-    /// The node's wall clock minus its steady clock; `None` before the first call of `look`.
+    /// The node's wall clock minus its steady clock; `None` before the first call of `read_wall`.
     wall_offset_us: Option<i64>,
     peers: BTreeMap<NodeName, PeerClock>,
     reading: Option<ClockReading>,
-    looked_at: Option<Timestamp>,
+    read_at: Option<Timestamp>,
 }
 
 /// The clock of another node.
@@ -116,7 +116,7 @@ impl CellTime {
             wall_offset_us: None,
             peers: BTreeMap::new(),
             reading: None,
-            looked_at: None,
+            read_at: None,
         }
     }
 
@@ -141,13 +141,17 @@ impl CellTime {
         };
         // The cell's time, unless more clocks agree on another time.
         let times = [0].into_iter().chain(errors.iter().map(|(_, us)| *us));
-        let time = times
+        let agreed = times
             .rev()
             .max_by_key(|time| agree(*time))
             .unwrap_or_default();
-        let is_cell_wrong = time.abs() >= micros(MIN_CLOCK_JUMP);
-        let is_certain = agree(time) > 1;
-        let time = if is_cell_wrong && is_certain { time } else { 0 };
+        let is_cell_wrong = agreed.abs() >= micros(MIN_CLOCK_JUMP);
+        let is_certain = agree(agreed) > 1;
+        let time = if is_cell_wrong && is_certain {
+            agreed
+        } else {
+            0
+        };
         let errors = errors
             .into_iter()
             .map(|(node, us)| (node, us.saturating_sub(time)));
@@ -266,13 +270,13 @@ impl CellTime {
 
     /// Removes the clock of a node that is not trusted any more. If that node led, its successor
     /// uses the other nodes' clocks.
-    pub fn forget(&mut self, name: &NodeName) {
+    pub fn remove(&mut self, name: &NodeName) {
         self.peers.remove(name);
     }
 
     /// Reads the wall clock, which is `wall_offset_us` ahead of the steady clock. A leader adjusts
     /// the cell's time.
-    pub fn look(
+    pub fn read_wall(
         &mut self,
         wall_offset_us: i64,
         leadership: &Leadership,
@@ -287,7 +291,7 @@ impl CellTime {
             );
         }
         let elapsed = self
-            .looked_at
+            .read_at
             .replace(now)
             .map_or(Duration::ZERO, |before| now.since(before));
         self.peers

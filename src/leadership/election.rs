@@ -273,7 +273,7 @@ impl Election {
     /// Removes peers that were given up, then carries out what is due in the current state. A
     /// follower that loses its leader starts to seek, and may claim leadership in the same call.
     fn run_timers(&mut self, now: Timestamp) {
-        self.peers.forget_silent(now);
+        self.peers.drop_silent(now);
         if let State::Following(_) = self.state {
             self.follow_timers(now);
         }
@@ -329,7 +329,7 @@ impl Election {
         if self.terms.window.0 == 0 {
             self.terms.window = (self.terms.seen, now);
         }
-        self.on_foreign_message(&message, now);
+        self.on_other_leadership(&message, now);
         let ElectionMessage {
             from,
             epoch,
@@ -383,7 +383,7 @@ impl Election {
             self.peers.record_term(&message.from, message.term);
         }
         let limit = self.term_limit(message.candidacy.role, now);
-        self.unlearn_first_term(limit, now);
+        self.drop_first_term(limit, now);
         if message.term > limit {
             self.effects.push(ElectionEffect::CountImplausible {
                 from: message.from.clone(),
@@ -400,14 +400,14 @@ impl Election {
     /// accepts the lowest term stated by any possible leader, so that one false claim does not
     /// separate it from the cell.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
-        let heard_all = self.config.contact_timeout();
+        let contact_timeout = self.config.contact_timeout();
         let Terms {
             seen,
             found,
             window: (before, since),
             ..
         } = &mut self.terms;
-        if *before > 0 && now.since(*since) >= heard_all {
+        if *before > 0 && now.since(*since) >= contact_timeout {
             *found = (*found).max(*seen);
         }
         if *before == 0 || now.since(*since) >= TERM_WINDOW {
@@ -433,7 +433,7 @@ impl Election {
 
     /// Drops a first term that the other candidates have not reached. Only a node without a term of
     /// its own does so.
-    fn unlearn_first_term(&mut self, limit: u64, now: Timestamp) {
+    fn drop_first_term(&mut self, limit: u64, now: Timestamp) {
         if self.terms.has_own() || self.terms.seen <= limit {
             return;
         }
@@ -592,7 +592,7 @@ impl Election {
     /// current epoch, and whether the peer's messages arrive here.
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {
         self.seq += 1;
-        let hears_you = self.peers.tell(to, now);
+        let hears_you = self.peers.record_sent(to, now);
         let message = ElectionMessage {
             schema: SCHEMA_VERSION,
             from: self.id.clone(),

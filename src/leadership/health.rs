@@ -11,7 +11,7 @@ use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{AwakeClock, Health};
 use crate::leadership::links::{Brokers, DataPlane, LinkState};
 use crate::leadership::readiness::round_timeout;
-use crate::leadership::timers::{HEALTH_PERIOD, LOOK_TOLERANCE};
+use crate::leadership::timers::{CHECK_TOLERANCE, HEALTH_PERIOD};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
@@ -24,7 +24,7 @@ pub struct HealthMonitor {
     sample: HealthSample,
     /// Clock of the time during which this node was awake.
     clock: AwakeClock,
-    look_at: Timestamp,
+    check_at: Timestamp,
     rounds_due: u64,
     round_due_at: Option<Timestamp>,
     load_percent: u8,
@@ -55,8 +55,8 @@ impl HealthMonitor {
             links: BTreeMap::new(),
             nodes: BTreeMap::new(),
             sample: HealthSample::default(),
-            clock: AwakeClock::new(now, LOOK_TOLERANCE),
-            look_at: now,
+            clock: AwakeClock::new(now, CHECK_TOLERANCE),
+            check_at: now,
             rounds_due: 0,
             round_due_at: None,
             load_percent: 0,
@@ -65,16 +65,16 @@ impl HealthMonitor {
 
     /// Time of the next check of the parts.
     pub fn next_deadline(&self) -> Timestamp {
-        self.look_at
+        self.check_at
     }
 
     /// True if the parts must be checked now; the next check is then due [`HEALTH_PERIOD`] later.
     pub fn is_due(&mut self, now: Timestamp) -> bool {
         // A clock that was set back does not postpone the check.
-        self.look_at = self.look_at.min(now + HEALTH_PERIOD);
-        let is_due = now >= self.look_at;
+        self.check_at = self.check_at.min(now + HEALTH_PERIOD);
+        let is_due = now >= self.check_at;
         if is_due {
-            self.look_at = now + HEALTH_PERIOD;
+            self.check_at = now + HEALTH_PERIOD;
         }
         is_due
     }
@@ -104,13 +104,13 @@ impl HealthMonitor {
     }
 
     /// Removes all links, because a restarted gateway connects anew.
-    pub fn forget_links(&mut self) {
-        self.forget_links_but(&[]);
+    pub fn drop_links(&mut self) {
+        self.drop_links_except(&[]);
     }
 
     /// Removes the links to all brokers except `wanted`: the gateway closes them and may reopen
     /// them later.
-    pub fn forget_links_but(&mut self, wanted: &[BrokerAddress]) {
+    pub fn drop_links_except(&mut self, wanted: &[BrokerAddress]) {
         self.links.retain(|broker, _| wanted.contains(broker));
         self.nodes.retain(|broker, _| wanted.contains(broker));
     }
@@ -267,8 +267,8 @@ mod tests {
         );
         monitor.record_link(&address(1), LinkState::Up);
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-        for looks in 1..=12 {
-            monitor.record_load(1, 0, now + HEALTH_PERIOD * looks);
+        for checks in 1..=12 {
+            monitor.record_load(1, 0, now + HEALTH_PERIOD * checks);
         }
         assert!(
             !monitor.health(&plane, &brokers, false, PERIOD).fuser,
@@ -297,7 +297,7 @@ mod tests {
             "the look may come before the fuser's next round"
         );
         let after = |ms| now + Duration::from_secs(10) + Duration::from_millis(ms);
-        (1..=8).for_each(|looks| monitor.record_load(1, 0, after(250 * looks)));
+        (1..=8).for_each(|checks| monitor.record_load(1, 0, after(250 * checks)));
         assert!(!fuser(&monitor), "the fuser had its time");
         monitor.record_load(2, 0, after(2250));
         assert!(fuser(&monitor));
@@ -411,7 +411,7 @@ mod tests {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         monitor.record_link(&address(1), LinkState::Up);
         monitor.record_link(&address(2), LinkState::Up);
-        monitor.forget_links_but(&[address(2)]);
+        monitor.drop_links_except(&[address(2)]);
         assert_eq!(
             (
                 monitor.is_logged_in(&address(1)),

@@ -22,7 +22,7 @@
 //!
 //! A node that starts may first receive a false claimant, and follows it until the true leader
 //! renews its term. For this reason an aggregator's own evidence is on probation until its
-//! leadership has been followed for [`EVIDENCE_TRIAL`]. Until then it counts on this node only,
+//! leadership has been followed for [`EVIDENCE_PROBATION`]. Until then it counts on this node only,
 //! because leadership may be handed to this node. It is dropped when the node follows another
 //! leader, which shares the evidence of its predecessors. If an honest leader led only for a short
 //! time, it shares its counts when it leads again.
@@ -36,7 +36,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use crate::leadership::timers::{
-    EVIDENCE_TRIAL, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD,
+    EVIDENCE_PROBATION, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD,
 };
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
@@ -278,7 +278,7 @@ impl LedgerResync {
             .is_none_or(|leader| *leader == share.node);
         let leader = share
             .epoch
-            .filter(|term| is_leader && leadership.knows_term(*term));
+            .filter(|term| is_leader && leadership.has_term(*term));
         self.receive(
             leader.map(|term| Epoch::new(term, share.node.clone())),
             ledger,
@@ -299,16 +299,16 @@ impl LedgerResync {
             && taken
                 .lane()
                 .is_some_and(|lane| !self.has_counted(&lane, ledger));
-        let trial_ends_at = self
-            .trial_end(&share.node, now)
+        let probation_ends_at = self
+            .probation_end(&share.node, now)
             .filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
-        let is_news = match trial_ends_at {
-            Some(ends_at) if is_statement => ledger.merge_on_trial(&taken, present, ends_at),
+        let is_merged = match probation_ends_at {
+            Some(ends_at) if is_statement => ledger.merge_on_probation(&taken, present, ends_at),
             None if is_statement => ledger.merge_statement(&taken, present),
             Some(_) | None => ledger.merge_share(&taken, present),
         };
         self.growth.record(&taken, ledger, now);
-        let is_news = is_news | is_reset | has_judged;
+        let is_news = is_merged | is_reset | has_judged;
         Ok(Merged {
             is_news,
             refused,
@@ -330,9 +330,9 @@ impl LedgerResync {
                 // Only this node has its current counts.
                 return false;
             }
-            let reason = if !leadership.knows_term(lane.term) {
+            let reason = if !leadership.has_term(lane.term) {
                 RejectReason::UnknownTerm
-            } else if !self.may_tell(&share.node, &lane, leadership) {
+            } else if !self.may_share(&share.node, &lane, leadership) {
                 RejectReason::Unattested
             } else if !is_plausible {
                 RejectReason::Implausible
@@ -381,7 +381,7 @@ impl LedgerResync {
     }
 
     /// True if a candidate may share the evidence of a lane.
-    fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
+    fn may_share(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
         let is_counting =
             |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
         if leadership.present_epoch().is_some_and(is_counting) {
@@ -415,7 +415,7 @@ impl LedgerResync {
         let has_failed = |lane: &Epoch| {
             leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader))
         };
-        let judged = ledger.end_trials(now, has_failed);
+        let judged = ledger.end_probations(now, has_failed);
         if judged
             .iter()
             .any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane))
@@ -428,10 +428,10 @@ impl LedgerResync {
     }
 
     /// End of the probation of a leader's own evidence, or `None` if it has ended.
-    fn trial_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
+    fn probation_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
         self.followed
             .get(leader)
-            .map(|followed| followed.since + EVIDENCE_TRIAL)
+            .map(|followed| followed.since + EVIDENCE_PROBATION)
             .filter(|ends_at| *ends_at > now)
     }
 
@@ -541,18 +541,18 @@ impl LedgerResync {
     /// All evidence except one lane. If evidence is signed, a node's own counts are not used while
     /// it does not lead.
     fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
-        let is_told = |term: u64, aggregator: &NodeName| {
+        let is_shared = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
             except != Some(&lane)
                 && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
         };
         let entries: Vec<_> = ledger
             .entries()
-            .filter(|entry| is_told(entry.epoch, &entry.aggregator))
+            .filter(|entry| is_shared(entry.epoch, &entry.aggregator))
             .collect();
         let marks: Vec<_> = ledger
             .marks()
-            .filter(|mark| is_told(mark.epoch, &mark.aggregator))
+            .filter(|mark| is_shared(mark.epoch, &mark.aggregator))
             .collect();
         let mut shares = self.shares(ledger, &entries, &marks);
         let statements = ledger
@@ -581,24 +581,24 @@ impl LedgerResync {
         }
         self.wait = self.ticks_per_snapshot.max(1);
         self.repeats -= 1;
-        let is_told = |term: u64, aggregator: &NodeName| {
+        let is_shared = |term: u64, aggregator: &NodeName| {
             let is_leaders = self
                 .leader
                 .as_ref()
                 .is_some_and(|lane| lane.term == term && lane.leader == *aggregator);
-            leadership.knows_term(term) && !is_leaders
+            leadership.has_term(term) && !is_leaders
         };
         let (mut entries, mut marks) = ledger.beyond(&self.shared);
-        entries.retain(|entry| is_told(entry.epoch, &entry.aggregator));
-        marks.retain(|mark| is_told(mark.epoch, &mark.aggregator));
+        entries.retain(|entry| is_shared(entry.epoch, &entry.aggregator));
+        marks.retain(|mark| is_shared(mark.epoch, &mark.aggregator));
         if !self.is_signed {
             return self.shares(ledger, &entries, &marks);
         }
-        let untold = ledger.statements().filter(|share| {
+        let unsent = ledger.statements().filter(|share| {
             share.entries.iter().any(|entry| entries.contains(entry))
                 || share.marks.iter().any(|mark| marks.contains(mark))
         });
-        untold.map(|share| self.passed_on(share)).collect()
+        unsent.map(|share| self.passed_on(share)).collect()
     }
 
     /// Splits counts and marks into shares of at most [`MAX_SHARE_ENTRIES`]. A signed share
@@ -620,11 +620,11 @@ impl LedgerResync {
         // Evidence can be signed only if it belongs to one lane.
         let is_together =
             |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
-        let entries = entries
+        let lanes = entries
             .chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
         let marks =
             marks.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
-        let entries = entries
+        let entries = lanes
             .flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES))
             .map(|entries| share(entries, &[]));
         entries

@@ -141,7 +141,7 @@ impl Links {
 
     /// Clears the wanted links, so that the next update returns them: a restarted gateway needs the
     /// whole list.
-    pub fn forget(&mut self) {
+    pub fn clear_wanted(&mut self) {
         self.wanted.clear();
     }
 
@@ -201,7 +201,7 @@ mod tests {
             update(&mut links, brokers(3, 2, 3), at(2200)),
             Some(vec![broker(2), broker(3)])
         );
-        links.forget();
+        links.clear_wanted();
         assert_eq!(
             update(&mut links, brokers(3, 2, 3), at(2300)),
             Some(vec![broker(2), broker(3)])

@@ -82,7 +82,7 @@ pub struct LeadershipNode {
     leadership: Leadership,
     status: NodeStatus,
     /// True if the current status was sent to the gateway.
-    is_status_told: bool,
+    is_status_published: bool,
     deadline: Timestamp,
     /// True if sockets are read before timers run, after a late wake-up.
     is_draining: bool,
@@ -149,7 +149,7 @@ impl LeadershipNode {
                 .map(|aggregator| Epoch::new(status.epoch, aggregator)),
             leadership: before.clone(),
             status,
-            is_status_told: false,
+            is_status_published: false,
             deadline: now,
             is_draining: false,
             effects: Vec::new(),
@@ -237,7 +237,7 @@ impl LeadershipNode {
             Input::OwnBroker { address } => self.own_broker = address,
             Input::BrokerProven { broker, node } => self.monitor.record_node(broker, node),
             Input::LinkChanged { broker, state } => self.on_link(&broker, state, now),
-            Input::StatusHeard { status } => self.on_status(&status, now),
+            Input::StatusReceived { status } => self.on_status(&status, now),
             Input::RoundAccepted { epoch, round } => self.on_round(epoch, round, now),
             Input::EvidenceReceived { from } => {
                 if let Some(preparation) = self
@@ -248,7 +248,7 @@ impl LeadershipNode {
                     preparation.has_evidence = true;
                 }
             }
-            Input::Looked {
+            Input::Observed {
                 rounds_due,
                 load_percent,
                 members,
@@ -272,9 +272,9 @@ impl LeadershipNode {
                 }
             }
             Input::GatewayRestarted => {
-                self.links.forget();
-                self.monitor.forget_links();
-                self.is_status_told = false;
+                self.links.clear_wanted();
+                self.monitor.drop_links();
+                self.is_status_published = false;
                 self.update_health(now);
             }
             Input::Described {
@@ -286,11 +286,11 @@ impl LeadershipNode {
                 self.keeps_reputations = keeps_reputations;
                 if self.status.description != description {
                     self.status.description = description;
-                    self.is_status_told = false;
+                    self.is_status_published = false;
                     self.feed(ElectionInput::Greet, now);
                 }
             }
-            Input::Telling {
+            Input::StatusParts {
                 troubles,
                 page,
                 dismissed,
@@ -301,7 +301,7 @@ impl LeadershipNode {
                     dismissed,
                     ..self.status.clone()
                 };
-                self.is_status_told &= status == self.status;
+                self.is_status_published &= status == self.status;
                 self.status = status;
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
@@ -311,7 +311,7 @@ impl LeadershipNode {
     /// Requests a check of the node's parts if one is due, and continues a preparation.
     fn run_timers(&mut self, now: Timestamp) {
         if self.monitor.is_due(now) {
-            self.effects.push(Effect::Look);
+            self.effects.push(Effect::Observe);
             // A vehicle only checks whether a login of unclear state is present.
             if !self.is_vehicle_only || self.logins.is_doubtful() {
                 self.effects.push(Effect::AskParts);
@@ -395,7 +395,7 @@ impl LeadershipNode {
     fn member_up(&mut self, member: SeenMember, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
-        self.forget_login(&peer, now);
+        self.remove_login(&peer, now);
         self.feed(ElectionInput::PeerAlive { peer }, now);
         self.update_health(now);
     }
@@ -404,7 +404,7 @@ impl LeadershipNode {
     /// whether it is lost.
     fn member_down(&mut self, name: NodeName, now: Timestamp) {
         self.members.member_down(&name, now);
-        self.forget_login(&name, now);
+        self.remove_login(&name, now);
         self.feed(ElectionInput::PeerDown { peer: name }, now);
     }
 
@@ -494,7 +494,7 @@ impl LeadershipNode {
             self.member_down(name, now);
         }
         for member in members {
-            if !self.members.knows(&member) {
+            if !self.members.contains(&member) {
                 self.member_up(member, now);
             }
         }
@@ -525,7 +525,7 @@ impl LeadershipNode {
             )
         };
         let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
-        if self.logins.look(&brokers.collect()) {
+        if self.logins.record(&brokers.collect()) {
             self.report_logins(now);
         }
         let (without_login, followers) = self.election.followers_without_login();
@@ -546,8 +546,8 @@ impl LeadershipNode {
 
     /// Removes the record of a login at a node's broker, because the node left or restarted;
     /// reports the change if the login was missing.
-    fn forget_login(&mut self, name: &NodeName, now: Timestamp) {
-        if self.logins.forget(name) {
+    fn remove_login(&mut self, name: &NodeName, now: Timestamp) {
+        if self.logins.remove(name) {
             self.report_logins(now);
         }
     }
@@ -642,10 +642,11 @@ impl LeadershipNode {
         if self.is_vehicle_only || health == self.health {
             return;
         }
-        match (self.health.is_fit(), health.is_fit()) {
-            (false, true) => self.log(Notice::Fit),
-            (true, false) => self.log(Notice::Unfit { health }),
-            _ => {}
+        let was_fit = self.health.is_fit();
+        if health.is_fit() && !was_fit {
+            self.log(Notice::Fit);
+        } else if was_fit && !health.is_fit() {
+            self.log(Notice::Unfit { health });
         }
         self.health = health;
         self.feed(ElectionInput::Health { health }, now);
@@ -681,7 +682,7 @@ impl LeadershipNode {
             },
         };
         if let Some(links) = self.links.update(brokers, now) {
-            self.monitor.forget_links_but(&links.brokers);
+            self.monitor.drop_links_except(&links.brokers);
             self.effects.push(Effect::SetLinks { links });
         }
         self.publish_status();
@@ -709,13 +710,13 @@ impl LeadershipNode {
         let term = epoch.map_or(0, |epoch| epoch.term);
         let aggregator = epoch.map(|epoch| &epoch.leader);
         let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
-        let told = (
+        let published = (
             self.status.state,
             self.status.epoch,
             self.status.aggregator.as_ref(),
             self.status.fit,
         );
-        if !self.is_status_told || told != (state, term, aggregator, fit) {
+        if !self.is_status_published || published != (state, term, aggregator, fit) {
             let aggregator = aggregator.cloned();
             self.status = NodeStatus {
                 state,
@@ -724,7 +725,7 @@ impl LeadershipNode {
                 fit,
                 ..self.status.clone()
             };
-            self.is_status_told = true;
+            self.is_status_published = true;
             self.effects.push(Effect::PublishStatus {
                 status: self.status.clone(),
             });

@@ -7,7 +7,7 @@
 //!   [`Leadership`] and does not query the election.
 //! - [`PublisherFilter`] is the rule of a node's own broker: which nodes may publish for the whole
 //!   cell.
-//! - [`Leadership::knows_term`] is the rule for evidence, and for maps that a new leader continues
+//! - [`Leadership::has_term`] is the rule for evidence, and for maps that a new leader continues
 //!   from.
 //!
 //! A round passes four checks in this order: its [`Origin`] is sufficient, its epoch and number
@@ -237,7 +237,7 @@ fn accepted(
     leadership: &Leadership,
 ) -> AcceptedRound {
     AcceptedRound {
-        is_known_term: leadership.knows_term(epoch.term),
+        is_known_term: leadership.has_term(epoch.term),
         epoch,
         round,
         is_sign_of_life,

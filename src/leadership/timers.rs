@@ -25,7 +25,7 @@
 //! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | a broker forwards every round that receivers may accept |
 //! | [`LINK_LINGER`] | 2 s | above [`FAREWELL_TIME`] | the last round finds a link |
 //! | [`HEALTH_PERIOD`] | 250 ms | below half of [`PART_TIMEOUT`] | two checks detect a part's end |
-//! | [`LOOK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late check on a busy machine still counts as time |
+//! | [`CHECK_TOLERANCE`] | 500 ms | above [`HEALTH_PERIOD`] | a late check on a busy machine still counts as time |
 //! | [`ANSWER_STEP`] times [`ANSWER_STEPS`] | 1 s | below [`PART_TIMEOUT`] | a hung part shows before its rounds do |
 //! | [`PART_TIMEOUT`] | 2 s and three rounds | above [`ECHO_TIMEOUT`] | a stalled broker is found by its missing echo |
 //! | [`ANSWER_STEP`] times [`READINESS_STEPS`] | 500 ms | above [`HEALTH_PERIOD`] | a page waits for a part for up to two checks |
@@ -43,7 +43,7 @@
 //! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, from any source |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader gets all evidence before its own next snapshot |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
-//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a false claimant is followed for a shorter time |
+//! | [`EVIDENCE_PROBATION`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a false claimant is followed for a shorter time |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from the far future would block all later resets |
 //! | `LIFE_SIGN_STEP_MS` | 10 ms | below a beat | signs of life are dated closely, and signed rarely |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
@@ -94,7 +94,7 @@ pub const HEALTH_PERIOD: Duration = Duration::from_millis(250);
 
 /// Lateness of a check that still counts as time; a longer delay means that the whole node was
 /// stalled.
-pub const LOOK_TOLERANCE: Duration = Duration::from_millis(500);
+pub const CHECK_TOLERANCE: Duration = Duration::from_millis(500);
 
 /// One step of the wait for a part's answer; a stop of the whole node takes up one step only.
 pub const ANSWER_STEP: Duration = Duration::from_millis(100);
@@ -172,7 +172,7 @@ pub const LAST_WORD_TIME: Duration = Duration::from_secs(5);
 
 /// Time for which a leader must be followed without interruption before other nodes pass its
 /// evidence on.
-pub const EVIDENCE_TRIAL: Duration = Duration::from_secs(20);
+pub const EVIDENCE_PROBATION: Duration = Duration::from_secs(20);
 
 /// Maximum time by which the clock of the node that reset all evidence may be ahead of this node's.
 pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
@@ -352,7 +352,7 @@ mod tests {
                 PART_TIMEOUT,
                 "two looks see a part's end",
             ),
-            (HEALTH_PERIOD, LOOK_TOLERANCE, "a late look is still time"),
+            (HEALTH_PERIOD, CHECK_TOLERANCE, "a late look is still time"),
             (
                 ANSWER_STEP * ANSWER_STEPS as u32,
                 PART_TIMEOUT,
@@ -418,7 +418,7 @@ mod tests {
             ),
             (
                 RENEWAL_PAUSE + 2 * config.idle_beat(),
-                EVIDENCE_TRIAL,
+                EVIDENCE_PROBATION,
                 "a false claimant's evidence goes no further",
             ),
             (

@@ -92,7 +92,7 @@ impl Leadership {
 
     /// True if the election has seen a term in use. Only messages authenticated with the cell's key
     /// count.
-    pub fn knows_term(&self, term: u64) -> bool {
+    pub fn has_term(&self, term: u64) -> bool {
         term <= self.term
     }
 }

@@ -21,7 +21,7 @@ const SETTLES_AFTER: Duration = Duration::from_secs(1);
 const JITTER_US: i64 = 100_000;
 
 /// Silence after which a cell and its epoch are dropped.
-const FORGOTTEN_AFTER: Duration = Duration::from_secs(60);
+const DROPPED_AFTER: Duration = Duration::from_secs(60);
 
 /// Time span for which delays are stored, to distinguish a lasting backlog from a clock offset.
 const BACKLOG_SPAN: Duration = Duration::from_secs(120);
@@ -48,7 +48,7 @@ const MIN_BACKLOG_CELLS: usize = 3;
 pub struct CellMapFilter {
     max_cells: usize,
     backlog: Duration,
-    looked_at: Timestamp,
+    checked_at: Timestamp,
     cells: BTreeMap<NodeName, CellOrder>,
 }
 
@@ -88,7 +88,7 @@ impl CellMapFilter {
         Self {
             max_cells,
             backlog: Duration::ZERO,
-            looked_at: Timestamp::default(),
+            checked_at: Timestamp::default(),
             cells: BTreeMap::new(),
         }
     }
@@ -120,14 +120,14 @@ impl CellMapFilter {
             return Err(RejectReason::NodeMismatch);
         }
         if self.cells.len() >= self.max_cells && !self.cells.contains_key(cell) {
-            self.forget_silent(received_at);
+            self.drop_silent(received_at);
             if self.cells.len() >= self.max_cells {
                 return Err(RejectReason::TooManyCells);
             }
         }
-        if received_at.since(self.looked_at) >= BACKLOG_PERIOD {
+        if received_at.since(self.checked_at) >= BACKLOG_PERIOD {
             self.backlog = self.find_backlog(received_at);
-            self.looked_at = received_at;
+            self.checked_at = received_at;
         }
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         let first = || CellOrder::new(epoch.clone(), received_at);
@@ -179,13 +179,13 @@ impl CellMapFilter {
     }
 
     /// Drops cells that have been silent for a minute.
-    pub fn forget_silent(&mut self, now: Timestamp) {
+    pub fn drop_silent(&mut self, now: Timestamp) {
         self.cells
-            .retain(|_, order| now.since(order.received_at) <= FORGOTTEN_AFTER);
+            .retain(|_, order| now.since(order.received_at) <= DROPPED_AFTER);
     }
 
     /// True if a map of the cell arrived recently.
-    pub fn knows(&self, cell: &NodeName) -> bool {
+    pub fn has_cell(&self, cell: &NodeName) -> bool {
         self.cells.contains_key(cell)
     }
 }

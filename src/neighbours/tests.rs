@@ -338,7 +338,8 @@ fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
 
 #[test]
 fn common_backlog_is_no_clock() {
-    let [none, all] = [[0; 4], [120; 4]];
+    let none = [0; 4];
+    let all = [120; 4];
     assert_eq!(late_for_long(4, |_| 0), [all, all]);
     assert_eq!(late_for_long(4, |_| 2000), [none, all], "all are late");
     assert_eq!(
@@ -361,7 +362,7 @@ fn common_backlog_is_no_clock() {
 }
 
 #[test]
-fn a_silent_cell_is_forgotten() {
+fn silent_cell_is_dropped() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     assert_eq!(neighbours.near(ms(3400)).len(), 1);

@@ -115,7 +115,7 @@ impl BayesPace {
         let limit = now - self.config.max_age();
         let mut oldest_capture = None;
         self.vehicles.retain(|_, vehicle| {
-            let oldest = vehicle.forget_before(limit);
+            let oldest = vehicle.drop_before(limit);
             oldest_capture = [oldest_capture, oldest].into_iter().flatten().min();
             oldest.is_some()
         });
@@ -151,7 +151,7 @@ impl BayesPace {
     /// listed as `seen`.
     fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
         let mut observations = self.associate(&report.objects);
-        let looked_at = |landmark| Observation {
+        let observation_of = |landmark| Observation {
             place: Place::object(landmark),
             found: None,
         };
@@ -161,10 +161,10 @@ impl BayesPace {
                 observations.extend(seen.iter().filter_map(|id| {
                     let landmark = self.landmarks.position_near(id, expected)?;
                     expected = landmark + 1;
-                    Some(looked_at(landmark))
+                    Some(observation_of(landmark))
                 }));
             }
-            None => observations.extend(self.in_stated_view(report).map(looked_at)),
+            None => observations.extend(self.in_stated_view(report).map(observation_of)),
         }
         // A stable sort: a detection at a place comes before the entry in `seen`.
         observations.sort_by_key(|observation| observation.place);

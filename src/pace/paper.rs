@@ -63,9 +63,11 @@ impl PaperPace {
             let known = std::mem::take(&mut latest.places)
                 .into_iter()
                 .zip(std::mem::take(&mut latest.objects));
-            (latest.places, latest.objects) = known
+            let (places, objects) = known
                 .filter_map(|(place, object)| Some((place_now(place)?, object)))
                 .unzip();
+            latest.places = places;
+            latest.objects = objects;
         }
         Self {
             gate_m: config.gate_m,

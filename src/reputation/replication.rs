@@ -275,7 +275,7 @@ impl ReputationLedger {
             if !has_half && !is_full {
                 return true;
             }
-            if !self.forget_oldest(lane, present, has_half) {
+            if !self.drop_oldest(lane, present, has_half) {
                 return false;
             }
         }
@@ -283,7 +283,7 @@ impl ReputationLedger {
 
     /// Drops the oldest lane except the current one, of the same aggregator or of all, if it is
     /// older than `lane` or `lane` is the current one.
-    fn forget_oldest(
+    fn drop_oldest(
         &mut self,
         lane: &Epoch,
         present: Option<&Epoch>,
@@ -298,11 +298,11 @@ impl ReputationLedger {
         let Some(oldest) = oldest.filter(gives_way) else {
             return false;
         };
-        self.forget(&oldest);
+        self.drop_lane(&oldest);
         true
     }
 
-    pub(super) fn forget(&mut self, lane: &Epoch) {
+    pub(super) fn drop_lane(&mut self, lane: &Epoch) {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);
         self.statements.remove(lane);
@@ -447,9 +447,9 @@ mod tests {
         assert_eq!(ledger.lanes(), MAX_LANES / 2);
         let oldest = ledger.entries().next().unwrap();
         assert_eq!(oldest.epoch, (MAX_LANES + MAX_LANES / 2) as u64);
-        let forgotten = LedgerEntry { epoch: 0, ..oldest };
+        let dropped = LedgerEntry { epoch: 0, ..oldest };
         assert!(
-            !ledger.merge_entries([forgotten], None),
+            !ledger.merge_entries([dropped], None),
             "an old lane does not come back"
         );
     }

@@ -33,7 +33,7 @@ impl ReputationLedger {
     }
 
     /// As [`Self::merge_statement`], on probation until `ends_at`.
-    pub fn merge_on_trial(
+    pub fn merge_on_probation(
         &mut self,
         share: &Arc<LedgerShare>,
         present: Option<&Epoch>,
@@ -52,7 +52,7 @@ impl ReputationLedger {
     /// Ends probations: of the lanes that `has_failed` selects, whose shares and counts are
     /// dropped, and of those whose time is over. Returns these lanes, and whether each is evidence
     /// now.
-    pub fn end_trials(
+    pub fn end_probations(
         &mut self,
         now: Timestamp,
         has_failed: impl Fn(&Epoch) -> bool,
@@ -65,7 +65,7 @@ impl ReputationLedger {
                     .get(&lane)
                     .map(|statements| statements.signed.clone())
                     .unwrap_or_default();
-                self.forget(&lane);
+                self.drop_lane(&lane);
                 kept.iter()
                     .for_each(|share| _ = self.merge_statement(share, None));
                 ended.push((lane, false));
@@ -93,10 +93,10 @@ impl ReputationLedger {
     }
 
     /// Drops this node's own counts, under the name `aggregator`; returns true if there were any.
-    pub fn forget_own(&mut self, aggregator: &NodeName) -> bool {
+    pub fn drop_own(&mut self, aggregator: &NodeName) -> bool {
         let is_own = |lane: &&Epoch| lane.leader == *aggregator && !self.is_stated(lane);
         let own: Vec<_> = self.lanes.keys().filter(is_own).cloned().collect();
-        own.iter().for_each(|lane| self.forget(lane));
+        own.iter().for_each(|lane| self.drop_lane(lane));
         !own.is_empty()
     }
 
@@ -124,12 +124,12 @@ impl ReputationLedger {
             {
                 continue;
             }
-            self.forget(&lane);
+            self.drop_lane(&lane);
             for share in signed.iter().filter(|share| is_valid(share)) {
                 self.merge_statement(share, None);
             }
             for share in tried.signed.iter().filter(|share| is_valid(share)) {
-                self.merge_on_trial(share, None, ends_at);
+                self.merge_on_probation(share, None, ends_at);
             }
             has_dropped = true;
         }

@@ -19,7 +19,7 @@ use nalgebra::{Matrix2, Vector2};
 use smallvec::SmallVec;
 
 use super::config::TracksConfig;
-use super::existence::LookState;
+use super::existence::ObservationState;
 use super::handles::TrackIndex;
 use super::kinematics::inverse;
 use super::scan::{Scan, ScannedDetection};
@@ -339,7 +339,7 @@ impl<'a> Assignment<'a> {
                     track.label_similarity(detection.object),
                 )
             }
-            None => (NEW_EXISTENCE * rate(LookState::First), 1.0),
+            None => (NEW_EXISTENCE * rate(ObservationState::First), 1.0),
         };
         let odds = detected.max(MIN_DETECTED) / (1.0 - detected).max(0.02);
         let new_per_m2 = detection.class.new_per_m2;

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Vector2;
 
-use super::existence::{DetectionRates, LookState};
+use super::existence::{DetectionRates, ObservationState};
 use crate::wire::{FieldOfView, ObjectReport, PerceivedObject};
 
 /// Estimated field of view and detection rates of one vehicle.
@@ -119,7 +119,7 @@ impl Coverage {
     pub(super) fn learn(
         &mut self,
         reported: &Vector2<f64>,
-        state: LookState,
+        state: ObservationState,
         is_hit: bool,
         probability: f64,
     ) {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use smallvec::SmallVec;
 
-use super::existence::{LookState, SensorHistory};
+use super::existence::{ObservationState, SensorHistory};
 use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
@@ -40,9 +40,9 @@ impl DetectionHistory {
     }
 
     /// State of a vehicle before its next observation.
-    pub(super) fn state_of(&self, sensor: SensorId) -> LookState {
+    pub(super) fn state_of(&self, sensor: SensorId) -> ObservationState {
         self.get(sensor)
-            .map_or(LookState::First, |history| history.state)
+            .map_or(ObservationState::First, |history| history.state)
     }
 
     /// Whether a vehicle has a slot or can have one.
@@ -51,7 +51,7 @@ impl DetectionHistory {
     }
 
     /// The history of a vehicle that observes the place of the object, if there is room for the history.
-    pub(super) fn for_look(
+    pub(super) fn for_observation(
         &mut self,
         sensor: SensorId,
         at: Timestamp,
@@ -111,13 +111,13 @@ impl DetectionHistory {
     fn find_slot(&self, sensor: SensorId, at: Timestamp) -> Option<usize> {
         let unused = || Some(self.histories.len()).filter(|count| *count < MAX_SLOTS);
         let expired = || {
-            let looks = self
+            let observations = self
                 .histories
                 .iter()
-                .map(|history| history.last_look)
+                .map(|history| history.observed_at)
                 .enumerate();
-            let (oldest, look) = looks.min_by_key(|(_, look)| *look)?;
-            (at.since(look) > SLOT_KEPT).then_some(oldest)
+            let (oldest, observed_at) = observations.min_by_key(|(_, observed_at)| *observed_at)?;
+            (at.since(observed_at) > SLOT_KEPT).then_some(oldest)
         };
         self.slot_of(sensor).or_else(unused).or_else(expired)
     }

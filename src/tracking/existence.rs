@@ -5,7 +5,7 @@
 //! of its result under two hypotheses: the track is an object, or it is clutter. Observations of one vehicle are
 //! correlated: an occluder, or a structure that resembles an object, is still there a tenth of a second later. So the
 //! results of one vehicle are a Markov chain under both hypotheses, and the probability of a detection depends on the
-//! [previous results](LookState). All probabilities are estimated by vehicle. Between observations, an object may
+//! [previous results](ObservationState). All probabilities are estimated by vehicle. Between observations, an object may
 //! leave.
 //!
 //! Confidences are additional evidence. The confidences of one vehicle are correlated: n confidences with correlation ρ
@@ -43,11 +43,11 @@ const UNSEEN_HZ: f64 = 0.15;
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 
 /// Minimum number of observations before a vehicle's statement is judged.
-const MIN_JUDGED_LOOKS: u32 = 5;
+const MIN_JUDGED_OBSERVATIONS: u32 = 5;
 
 /// Results of a vehicle's observations of an object: the last result, and the number of equal results in a row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) enum LookState {
+pub(super) enum ObservationState {
     /// The vehicle has not observed the place yet.
     #[default]
     First,
@@ -59,7 +59,7 @@ pub(super) enum LookState {
     Miss(u8),
 }
 
-impl LookState {
+impl ObservationState {
     const COUNT: usize = 1 + 3 * Self::RUNS;
 
     /// Number of classes of runs by length: 1, 2 to 3, and longer.
@@ -102,19 +102,19 @@ impl LookState {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DetectionRates {
     /// Numbers of detections and of observations.
-    counts: [(f64, f64); LookState::COUNT],
+    counts: [(f64, f64); ObservationState::COUNT],
 }
 
 impl DetectionRates {
     /// Number of observations as which the usual rates count.
-    const USUAL_LOOKS: f64 = 10.0;
+    const USUAL_OBSERVATIONS: f64 = 10.0;
 
     /// Number of observations beyond which earlier observations are discounted.
     const MEMORY: f64 = 400.0;
 
-    fn usual(rates: [f64; LookState::COUNT]) -> Self {
+    fn usual(rates: [f64; ObservationState::COUNT]) -> Self {
         Self {
-            counts: rates.map(|rate| (rate * Self::USUAL_LOOKS, Self::USUAL_LOOKS)),
+            counts: rates.map(|rate| (rate * Self::USUAL_OBSERVATIONS, Self::USUAL_OBSERVATIONS)),
         }
     }
 
@@ -129,32 +129,32 @@ impl DetectionRates {
     }
 
     /// The rate at an observation in this state.
-    pub(super) fn rate(&self, state: LookState) -> f64 {
-        let (hits, looks) = self.counts[state.index()];
-        (hits / looks).clamp(0.01, 0.985)
+    pub(super) fn rate(&self, state: ObservationState) -> f64 {
+        let (hits, observations) = self.counts[state.index()];
+        (hits / observations).clamp(0.01, 0.985)
     }
 
     /// Updates the mean with an observation of a weight, 0 to 1.
-    pub(super) fn learn(&mut self, state: LookState, is_hit: bool, weight: f64) {
-        let (hits, looks) = &mut self.counts[state.index()];
+    pub(super) fn learn(&mut self, state: ObservationState, is_hit: bool, weight: f64) {
+        let (hits, observations) = &mut self.counts[state.index()];
         *hits += weight * f64::from(u8::from(is_hit));
-        *looks += weight;
-        let kept = (Self::MEMORY / *looks).min(1.0);
+        *observations += weight;
+        let kept = (Self::MEMORY / *observations).min(1.0);
         *hits *= kept;
-        *looks *= kept;
+        *observations *= kept;
     }
 }
 
 /// Probabilities of a detection at one observation: if the track is an object, and if it is clutter.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct LookRates {
+pub(super) struct ObservationRates {
     pub(super) object: f64,
     pub(super) clutter: f64,
     /// True if the vehicle states its pose. Without a pose, the vehicle may not have observed the place.
     pub(super) has_pose: bool,
 }
 
-impl LookRates {
+impl ObservationRates {
     /// Log-likelihood ratio of a result: an object compared with clutter.
     pub(super) fn nats(&self, is_hit: bool) -> f64 {
         if is_hit {
@@ -226,12 +226,12 @@ impl Existence {
 #[derive(Debug, Clone)]
 pub(super) struct SensorHistory {
     pub(super) sensor: SensorId,
-    pub(super) state: LookState,
-    pub(super) last_look: Timestamp,
+    pub(super) state: ObservationState,
+    pub(super) observed_at: Timestamp,
     pub(super) last_hit: Option<Timestamp>,
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
-    pub(super) looks: u32,
+    pub(super) observations: u32,
     /// True if the vehicle stated its pose at the last miss without occlusion.
     is_view_known: bool,
     /// True if the position of the last detection was wrong by more than the vehicle states.
@@ -252,7 +252,7 @@ pub(super) struct SensorHistory {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ExistenceStatement {
     pub(super) hits: u32,
-    pub(super) looks: u32,
+    pub(super) observations: u32,
 }
 
 impl SensorHistory {
@@ -260,11 +260,11 @@ impl SensorHistory {
     pub(super) fn new(sensor: SensorId, at: Timestamp) -> Self {
         Self {
             sensor,
-            state: LookState::First,
-            last_look: at,
+            state: ObservationState::First,
+            observed_at: at,
             last_hit: None,
             position: Vector2::zeros(),
-            looks: 0,
+            observations: 0,
             is_view_known: false,
             is_shifted: false,
             unjudged: ExistenceStatement::default(),
@@ -284,11 +284,11 @@ impl SensorHistory {
         nats: f64,
         confidence_nats: f64,
     ) {
-        self.look(at, nats);
+        self.observe(at, nats);
         self.score += confidence_nats;
         self.weight += 1.0;
         self.unjudged.hits += 1;
-        self.unjudged.looks += 1;
+        self.unjudged.observations += 1;
         self.state = self.state.after(true);
         if self.last_hit.is_none_or(|last| at >= last) {
             self.last_hit = Some(at);
@@ -297,40 +297,40 @@ impl SensorHistory {
     }
 
     /// Records an observation of the object's place without a detection.
-    pub(super) fn miss(&mut self, at: Timestamp, rates: &LookRates) {
-        self.look(at, rates.nats(false));
+    pub(super) fn miss(&mut self, at: Timestamp, rates: &ObservationRates) {
+        self.observe(at, rates.nats(false));
         self.state = self.state.after(false);
     }
 
     /// Counts a miss as a statement of the vehicle that the place is empty.
     pub(super) fn state_miss(&mut self) {
-        self.unjudged.looks += 1;
+        self.unjudged.observations += 1;
     }
 
     /// Counts a miss without occlusion as evidence that the object does not exist.
-    pub(super) fn deny(&mut self, rates: &LookRates) {
+    pub(super) fn deny(&mut self, rates: &ObservationRates) {
         self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
         self.is_view_known = rates.has_pose;
     }
 
     /// Fades earlier evidence and counts an observation.
-    fn look(&mut self, at: Timestamp, nats: f64) {
-        let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
+    fn observe(&mut self, at: Timestamp, nats: f64) {
+        let kept = (-at.since(self.observed_at).as_secs_f64() / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
         self.sequence = (self.sequence * kept + nats).clamp(-MAX_PEER_NATS, MAX_PEER_NATS);
-        self.last_look = self.last_look.max(at);
-        self.looks = self.looks.saturating_add(1);
+        self.observed_at = self.observed_at.max(at);
+        self.observations = self.observations.saturating_add(1);
     }
 
     /// The statement since the last judgement, if a judgement is due.
     pub(super) fn take_due(&mut self, at: Timestamp) -> Option<ExistenceStatement> {
-        (at.since(self.judged_at) >= JUDGED_AFTER && self.unjudged.looks >= MIN_JUDGED_LOOKS).then(
-            || {
+        (at.since(self.judged_at) >= JUDGED_AFTER
+            && self.unjudged.observations >= MIN_JUDGED_OBSERVATIONS)
+            .then(|| {
                 self.judged_at = at;
                 std::mem::take(&mut self.unjudged)
-            },
-        )
+            })
     }
 
     /// Evidence of this vehicle alone for the object at `at`, nats.
@@ -367,7 +367,7 @@ impl SensorHistory {
     }
 
     fn kept(&self, at: Timestamp) -> f64 {
-        (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp()
+        (-at.since(self.observed_at).as_secs_f64() / MEMORY_S).exp()
     }
 }
 

@@ -8,7 +8,7 @@ use uuid::Uuid;
 
 use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{LookState, SensorHistory};
+use super::existence::{ObservationState, SensorHistory};
 use super::handles::TrackIndex;
 use super::kinematics::{Measurement, VELOCITY_SIGMA_MPS};
 use super::population::Population;
@@ -55,7 +55,7 @@ pub(super) fn merge(
             let sensor = sensors.get(history.sensor);
             sensor
                 .and_then(|sensor| sensor.coverage.rates_at(&history.position))
-                .map_or(UNKNOWN_RATE, |rates| rates.rate(LookState::Hit(1)))
+                .map_or(UNKNOWN_RATE, |rates| rates.rate(ObservationState::Hit(1)))
         };
         let mut twins = std::mem::take(&mut tracks[older].twins);
         let other = &tracks[later];
@@ -132,7 +132,7 @@ pub(super) fn prune(
         }
         is_kept
     });
-    if sensors.forget_silent(now - latent - REMEMBERED) {
+    if sensors.drop_silent(now - latent - REMEMBERED) {
         tracks.retain_vehicles(|vehicle| sensors.get(vehicle).is_some());
     }
 }

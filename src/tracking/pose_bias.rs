@@ -227,8 +227,8 @@ impl PoseBias {
                 let squared = residual.norm_squared() / (variance + pair.common);
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // The error that the references share remains with any number of references.
-                let variance = pair.variance + frames * pair.of_object;
-                let weight = trust / (variance + pair.common * pairs.len() as f64);
+                let lasting_variance = pair.variance + frames * pair.of_object;
+                let weight = trust / (lasting_variance + pair.common * pairs.len() as f64);
                 normal.add(
                     &Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]),
                     &residual,

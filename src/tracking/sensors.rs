@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
-use super::existence::{DetectionRates, LookRates, LookState};
+use super::existence::{DetectionRates, ObservationRates, ObservationState};
 use super::handles::SensorId;
 use super::population::Births;
 use super::pose_bias::PoseBias;
@@ -163,7 +163,7 @@ impl Sensors {
     }
 
     /// Removes the vehicles whose last report is before `limit`, and keeps their counts; true if a vehicle was removed.
-    pub(super) fn forget_silent(&mut self, limit: Timestamp) -> bool {
+    pub(super) fn drop_silent(&mut self, limit: Timestamp) -> bool {
         let is_silent = |model: &mut Box<SensorModel>| model.last_report < limit;
         let mut silent = Vec::new();
         for sensor in self
@@ -172,7 +172,7 @@ impl Sensors {
             .filter_map(|slot| slot.take_if(is_silent))
         {
             self.ids.remove(&sensor.node);
-            self.fleet.forget(sensor.id);
+            self.fleet.remove(sensor.id);
             silent.push((sensor.node, sensor.counts));
         }
         let is_any_silent = !silent.is_empty();
@@ -224,25 +224,29 @@ impl SensorModel {
     }
 
     /// Rates at an observation of a reported position in this state; `None` outside the field of view.
-    pub(super) fn look_rates(
+    pub(super) fn observation_rates(
         &self,
         reported: &Vector2<f64>,
-        state: LookState,
-    ) -> Option<LookRates> {
+        state: ObservationState,
+    ) -> Option<ObservationRates> {
         let object = self.coverage.rates_at(reported)?;
         Some(self.rates(object, state))
     }
 
     /// Rates at a detection in this state, which may be outside the field of view.
-    pub(super) fn hit_rates(&self, reported: &Vector2<f64>, state: LookState) -> LookRates {
+    pub(super) fn hit_rates(
+        &self,
+        reported: &Vector2<f64>,
+        state: ObservationState,
+    ) -> ObservationRates {
         match self.coverage.rates_at(reported) {
             Some(object) => self.rates(object, state),
             None => self.rates(&DetectionRates::object(), state),
         }
     }
 
-    fn rates(&self, object: &DetectionRates, state: LookState) -> LookRates {
-        LookRates {
+    fn rates(&self, object: &DetectionRates, state: ObservationState) -> ObservationRates {
+        ObservationRates {
             object: object.rate(state),
             clutter: self.clutter.rate(state),
             has_pose: self.coverage.position().is_some(),

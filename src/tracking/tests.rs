@@ -3,7 +3,7 @@ mod beside;
 mod crowd;
 mod fast;
 mod fixed;
-mod foreign;
+mod neighbour_tracks;
 mod passing;
 mod shifted;
 mod trust;

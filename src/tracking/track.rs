@@ -202,7 +202,7 @@ impl Track {
     /// Records whether any vehicle detects the object at `at`.
     pub(super) fn record_detected(&mut self, at: Timestamp) {
         self.is_detected = self.history.iter().any(|history| {
-            history.state.is_hit() && at.since(history.last_look) <= DETECTED_WITHIN
+            history.state.is_hit() && at.since(history.observed_at) <= DETECTED_WITHIN
         });
     }
 
@@ -215,16 +215,16 @@ impl Track {
         trust: impl Fn(SensorId) -> f64,
     ) -> f64 {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
-        let looks = self.existence.log_odds_at(at, leaving_hz, is_detected);
+        let observations = self.existence.log_odds_at(at, leaving_hz, is_detected);
         let mut confidences = 0.0;
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);
         }
         let Some(denied) = self.denied_nats(at, trust) else {
-            return logistic(looks + confidences);
+            return logistic(observations + confidences);
         };
         // The cause of a false detection persists, so repeated detections by one vehicle are not independent.
-        let sole = looks.min(SOLE_NATS) + confidences;
+        let sole = observations.min(SOLE_NATS) + confidences;
         if denied < 0.0 {
             logistic(sole.min(MAX_DENIED_NATS) + denied)
         } else {
@@ -314,7 +314,7 @@ impl Track {
         existence: f64,
         name: impl Fn(SensorId) -> Option<NodeName>,
     ) -> FusedObject {
-        let covariance = self.state.covariance_at(now);
+        let matrix = self.state.covariance_at(now);
         let position = self.state.position_at(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
@@ -323,12 +323,12 @@ impl Track {
                 .iter()
                 .map(|(label, weight)| (label.clone(), weight / total.max(1e-9))),
         );
-        let sigma_m = (covariance.trace() / 2.0).sqrt();
+        let sigma_m = (matrix.trace() / 2.0).sqrt();
         let usable = 1.0 - (-ERROR_RATE * USABLE_M / sigma_m).exp();
         let covariance = Covariance {
-            xx: covariance.m11,
-            xy: covariance.m12,
-            yy: covariance.m22,
+            xx: matrix.m11,
+            xy: matrix.m12,
+            yy: matrix.m22,
         };
         let confidence = existence * usable;
         let has_velocity = self.hits > 1;

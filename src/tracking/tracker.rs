@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::config::TracksConfig;
-use super::foreign::NeighbourTracks;
 use super::lifecycle::{adopt_map, merge, prune};
+use super::neighbour_tracks::NeighbourTracks;
 use super::population::Population;
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
@@ -28,7 +28,7 @@ pub struct Tracker {
     config: TracksConfig,
     pub(super) sensors: Sensors,
     tracks: TrackStore,
-    foreign: NeighbourTracks,
+    neighbours: NeighbourTracks,
     population: Population,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
@@ -48,7 +48,7 @@ impl Tracker {
         Self {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
-            foreign: NeighbourTracks::default(),
+            neighbours: NeighbourTracks::default(),
             population: Population::default(),
             config,
             pending: Vec::new(),
@@ -122,7 +122,7 @@ impl Tracker {
     /// Replaces all objects of neighbouring cells; their ages are relative to `stated_at`, and their times use its
     /// clock. A turning frame has no position on Earth and no neighbours.
     pub fn on_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
-        self.foreign.on_neighbours(
+        self.neighbours.on_neighbours(
             objects,
             stated_at,
             &mut self.tracks,
@@ -133,17 +133,17 @@ impl Tracker {
 
     /// True if an object of a neighbouring cell is not published, because it matches a track or its cell is distrusted.
     pub fn hides(&self, object: &NeighbourObject) -> bool {
-        self.foreign.hides(object, &self.sensors.fleet)
+        self.neighbours.hides(object, &self.sensors.fleet)
     }
 
     /// Weight of a neighbouring cell's statements, 0 to 1: 1 for a newcomer, 0 for a cell with proven false statements.
     pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
-        self.foreign.trust(cell, &self.sensors.fleet)
+        self.neighbours.trust(cell, &self.sensors.fleet)
     }
 
     /// Identities that tracks took over from neighbouring cells so far.
     pub fn hand_overs(&self) -> HandOvers {
-        self.foreign.hand_overs
+        self.neighbours.hand_overs
     }
 
     /// Begins a leadership: the previous leader judges earlier observations.
@@ -207,8 +207,8 @@ impl Tracker {
             now,
             &self.config,
         );
-        self.foreign
-            .forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
+        self.neighbours
+            .drop_before(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
         let mut objects = self.objects(now);
         let mut pose_corrections = self.corrections();
         self.frame
@@ -260,7 +260,7 @@ impl Tracker {
                 config: &self.config,
                 tracks: &mut self.tracks,
                 sensors: &mut self.sensors,
-                foreign: &mut self.foreign,
+                neighbours: &mut self.neighbours,
                 population: &mut self.population,
                 at,
             };

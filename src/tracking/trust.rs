@@ -52,7 +52,7 @@ struct PeerEvidence {
     /// Log-odds of existence.
     nats: f64,
     /// Number of vehicles that observed the place.
-    looking: usize,
+    observing: usize,
     /// Number of vehicles that detected the object recently.
     detecting: usize,
 }
@@ -71,12 +71,12 @@ impl PeerEvidence {
             .iter()
             .filter(|history| Some(history.sensor) != sensor)
         {
-            if at.since(history.last_look) > JUDGED_AFTER {
+            if at.since(history.observed_at) > JUDGED_AFTER {
                 continue;
             }
             let weight = fleet.trust(history.sensor);
             peers.nats += weight * history.nats(at);
-            peers.looking += usize::from(weight > MIN_PEER_WEIGHT && history.looks > 5);
+            peers.observing += usize::from(weight > MIN_PEER_WEIGHT && history.observations > 5);
             let is_recent = history
                 .last_hit
                 .is_some_and(|hit| at.since(hit) <= JUDGED_AFTER);
@@ -87,17 +87,17 @@ impl PeerEvidence {
 
     /// Judges a statement by this evidence; `None` if the evidence is insufficient.
     fn judge(&self, statement: ExistenceStatement) -> Option<Judgement> {
-        let share = f64::from(statement.hits) / f64::from(statement.looks.max(1));
+        let share = f64::from(statement.hits) / f64::from(statement.observations.max(1));
         let exists = self.nats >= EXISTS_NATS;
         if self.detecting >= 1 && exists && share >= MIN_STATED {
             Some(Judgement::Correct)
         } else if self.detecting >= 2
-            && 2 * self.detecting > self.looking
+            && 2 * self.detecting > self.observing
             && exists
             && statement.hits == 0
         {
             Some(Judgement::Miss)
-        } else if self.looking >= 2
+        } else if self.observing >= 2
             && self.detecting == 0
             && self.nats <= ABSENT_NATS
             && share >= MIN_STATED
@@ -242,7 +242,7 @@ impl Fleet {
         self.trust[number] = counts.trust(&self.reputation);
     }
 
-    pub(super) fn forget(&mut self, sensor: SensorId) {
+    pub(super) fn remove(&mut self, sensor: SensorId) {
         self.trust[sensor.number()] = 0.0;
     }
 
@@ -275,7 +275,10 @@ impl Fleet {
         history: &DetectionHistory,
         at: Timestamp,
     ) -> Option<Judgement> {
-        PeerEvidence::of(history, None, at, self).judge(ExistenceStatement { hits: 1, looks: 1 })
+        PeerEvidence::of(history, None, at, self).judge(ExistenceStatement {
+            hits: 1,
+            observations: 1,
+        })
     }
 
     fn learn(&mut self, distance_m: f64, is_detected: bool) {

@@ -53,18 +53,19 @@ impl Twins {
         let mut is_own_alone = false;
         let mut is_other_alone = false;
         let mut at = since;
-        for look in own.iter() {
-            let Some(theirs) = other.get(look.sensor) else {
+        for own_history in own.iter() {
+            let Some(theirs) = other.get(own_history.sensor) else {
                 continue;
             };
-            let is_new = look.last_look > since && look.last_look == theirs.last_look;
+            let is_new =
+                own_history.observed_at > since && own_history.observed_at == theirs.observed_at;
             let [is_own, is_other] =
-                [look, theirs].map(|history| history.last_hit == Some(history.last_look));
+                [own_history, theirs].map(|history| history.last_hit == Some(history.observed_at));
             if !is_new || !(is_own || is_other) {
                 continue;
             }
-            at = at.max(look.last_look);
-            let rate = rate(look);
+            at = at.max(own_history.observed_at);
+            let rate = rate(own_history);
             if is_own && is_other {
                 nats -= (rate / DUPLICATE).ln().max(0.0);
             } else {

@@ -9,11 +9,11 @@ use nalgebra::{Matrix2, Vector2};
 use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{ExistenceStatement, LookRates, LookState, logistic};
-use super::foreign::NeighbourTracks;
+use super::existence::{ExistenceStatement, ObservationRates, ObservationState, logistic};
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
+use super::neighbour_tracks::NeighbourTracks;
 use super::population::Population;
 use super::registration::{RegistrationFrame, RegistrationSample};
 use super::scan::{Scan, ScannedDetection};
@@ -32,7 +32,7 @@ const MANOEUVRE: f64 = 5.0;
 const CERTAIN: f64 = 0.9;
 
 /// Maximum number of objects of each neighbouring cell that are compared with a report.
-const MAX_FOREIGN_EACH: usize = 32;
+const MAX_NEIGHBOURS_EACH: usize = 32;
 
 /// Log-odds that a vehicle exists if it states its own pose.
 const OWN_NATS: f64 = 4.0;
@@ -46,7 +46,7 @@ pub(super) struct InstantOutcome {
 }
 
 /// Observation of one track by one vehicle.
-struct Look {
+struct Observation {
     track: TrackIndex,
     /// Number of the scan.
     scan: usize,
@@ -54,9 +54,9 @@ struct Look {
     detection: Option<usize>,
     /// The position at which the vehicle would have reported the object, metres.
     place: Vector2<f64>,
-    rates: LookRates,
+    rates: ObservationRates,
     /// State before the observation.
-    state: LookState,
+    state: ObservationState,
     /// True if the place is in the field of view.
     is_in_view: bool,
     /// True if another detection of the vehicle may hide the place.
@@ -68,7 +68,7 @@ pub(super) struct InstantUpdate<'a> {
     pub(super) config: &'a TracksConfig,
     pub(super) tracks: &'a mut TrackStore,
     pub(super) sensors: &'a mut Sensors,
-    pub(super) foreign: &'a mut NeighbourTracks,
+    pub(super) neighbours: &'a mut NeighbourTracks,
     pub(super) population: &'a mut Population,
     pub(super) at: Timestamp,
 }
@@ -107,16 +107,16 @@ impl InstantUpdate<'_> {
                 has_jumped: scan.has_jumped,
                 samples: Vec::with_capacity(scan.detections.len()),
             }));
-        let looks = self.looks(&scans, &hypotheses);
+        let observations = self.observations(&scans, &hypotheses);
         for hypothesis in &hypotheses {
             if let Some(track) = hypothesis.track.filter(|_| !hypothesis.hits.is_empty()) {
                 self.sample(track, hypothesis, &scans, &mut outcome.frames);
                 self.update_track(track, hypothesis, &scans);
             }
         }
-        self.weigh(&looks, &scans, &mut outcome.evidence);
+        self.weigh(&observations, &scans, &mut outcome.evidence);
         for scan in &scans {
-            self.look_at_foreign(scan);
+            self.judge_neighbours(scan);
         }
         for hypothesis in &hypotheses {
             if hypothesis.track.is_none() && !hypothesis.hits.is_empty() {
@@ -177,9 +177,9 @@ impl InstantUpdate<'_> {
     }
 
     /// All observations of the instant: detections, and misses of the tracks in view.
-    fn looks(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<Look> {
+    fn observations(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<Observation> {
         let mut detected: Vec<Vec<TrackIndex>> = vec![Vec::new(); scans.len()];
-        let mut looks = Vec::new();
+        let mut observations = Vec::new();
         for hypothesis in hypotheses {
             let Some(track) = hypothesis.track else {
                 continue;
@@ -193,7 +193,7 @@ impl InstantUpdate<'_> {
                 };
                 let place = scan.detections[detection].reported;
                 let state = history.state_of(scan.sensor);
-                looks.push(Look {
+                observations.push(Observation {
                     track,
                     scan: number,
                     detection: Some(detection),
@@ -207,9 +207,9 @@ impl InstantUpdate<'_> {
         }
         for (number, (scan, detected)) in scans.iter().zip(&mut detected).enumerate() {
             detected.sort_unstable();
-            self.misses(number, scan, detected, &mut looks);
+            self.misses(number, scan, detected, &mut observations);
         }
-        looks
+        observations
     }
 
     /// Adds a miss of every track in the vehicle's view that is not among the `detected`.
@@ -218,7 +218,7 @@ impl InstantUpdate<'_> {
         number: usize,
         scan: &Scan<'_>,
         detected: &[TrackIndex],
-        looks: &mut Vec<Look>,
+        observations: &mut Vec<Observation>,
     ) {
         let Some(sensor) = self.sensors.get(scan.sensor) else {
             return;
@@ -237,16 +237,16 @@ impl InstantUpdate<'_> {
             let track = &self.tracks[indexed.track];
             let history = track.history.get(scan.sensor);
             let state = track.history.state_of(scan.sensor);
-            let Some(rates) = sensor.look_rates(&place, state) else {
+            let Some(rates) = sensor.observation_rates(&place, state) else {
                 return;
             };
             let has_jumped = (track.state.position_at(self.at) - place).norm() > self.config.gate_m;
-            let is_stale = history.is_some_and(|history| history.last_look >= self.at);
+            let is_stale = history.is_some_and(|history| history.observed_at >= self.at);
             let has_room = history.is_some() || track.history.has_room(scan.sensor, self.at);
             if track.vehicle == Some(scan.sensor) || has_jumped || is_stale || !has_room {
                 return;
             }
-            looks.push(Look {
+            observations.push(Observation {
                 track: indexed.track,
                 scan: number,
                 detection: None,
@@ -354,20 +354,25 @@ impl InstantUpdate<'_> {
     }
 
     /// Adds all observations to the existences, then updates rates, calibrations and judgements.
-    fn weigh(&mut self, looks: &[Look], scans: &[Scan<'_>], evidence: &mut Vec<Evidence>) {
+    fn weigh(
+        &mut self,
+        observations: &[Observation],
+        scans: &[Scan<'_>],
+        evidence: &mut Vec<Evidence>,
+    ) {
         let at = self.at;
         let leaving_hz = self.population.leaving_hz();
         let mut due = Vec::new();
-        for (number, look) in looks.iter().enumerate() {
-            let scan = &scans[look.scan];
-            let track = &mut self.tracks[look.track];
+        for (number, observation) in observations.iter().enumerate() {
+            let scan = &scans[observation.scan];
+            let track = &mut self.tracks[observation.track];
             track.predict_existence(at, leaving_hz);
-            let nats = look.rates.nats(look.detection.is_some());
-            if look.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
+            let nats = observation.rates.nats(observation.detection.is_some());
+            if observation.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
             }
             track.existence.add(scan.trust * nats);
-            let statement = match look.detection.map(|number| &scan.detections[number]) {
+            let statement = match observation.detection.map(|number| &scan.detections[number]) {
                 Some(detection) => {
                     let sensor = self.sensors.get(scan.sensor);
                     let is_shifted =
@@ -375,7 +380,7 @@ impl InstantUpdate<'_> {
                     let slot = if scan.is_trusted() {
                         track.history.for_hit(scan.sensor, at)
                     } else {
-                        track.history.for_look(scan.sensor, at)
+                        track.history.for_observation(scan.sensor, at)
                     };
                     slot.and_then(|history| {
                         let position = detection.measurement.position;
@@ -384,35 +389,46 @@ impl InstantUpdate<'_> {
                         history.take_due(at)
                     })
                 }
-                None => track.history.for_look(scan.sensor, at).and_then(|history| {
-                    history.miss(at, &look.rates);
-                    if !look.is_hidden {
-                        history.state_miss();
-                        history.deny(&look.rates);
-                    }
-                    history.take_due(at)
-                }),
+                None => track
+                    .history
+                    .for_observation(scan.sensor, at)
+                    .and_then(|history| {
+                        history.miss(at, &observation.rates);
+                        if !observation.is_hidden {
+                            history.state_miss();
+                            history.deny(&observation.rates);
+                        }
+                        history.take_due(at)
+                    }),
             };
             due.extend(statement.map(|statement| (number, statement)));
         }
-        let mut seen: Vec<TrackIndex> = looks.iter().map(|look| look.track).collect();
+        let mut seen: Vec<TrackIndex> = observations
+            .iter()
+            .map(|observation| observation.track)
+            .collect();
         seen.sort_unstable();
         seen.dedup();
         for track in seen {
             self.tracks[track].record_detected(at);
         }
-        for look in looks {
-            self.learn(look, &scans[look.scan]);
+        for observation in observations {
+            self.learn(observation, &scans[observation.scan]);
         }
         for (number, statement) in due {
-            let look = &looks[number];
-            self.judge(look, scans[look.scan].sensor, statement, evidence);
+            let observation = &observations[number];
+            self.judge(
+                observation,
+                scans[observation.scan].sensor,
+                statement,
+                evidence,
+            );
         }
     }
 
     /// Updates rates and calibration with an observation and the existence after all observations of the instant.
-    fn learn(&mut self, look: &Look, scan: &Scan<'_>) {
-        let track = &mut self.tracks[look.track];
+    fn learn(&mut self, observation: &Observation, scan: &Scan<'_>) {
+        let track = &mut self.tracks[observation.track];
         if track.vehicle.is_some() {
             return;
         }
@@ -423,20 +439,22 @@ impl InstantUpdate<'_> {
             track.is_settled = true;
             self.sensors.settle(track.spawned_by, true);
         }
-        let is_hit = look.detection.is_some();
+        let is_hit = observation.detection.is_some();
         let is_evident = track.is_confirmed()
-            && look.is_in_view
-            && (look.state.is_hit() || track.is_seen_by_others(scan.sensor, self.at));
+            && observation.is_in_view
+            && (observation.state.is_hit() || track.is_seen_by_others(scan.sensor, self.at));
         let Some(sensor) = self.sensors.get_mut(scan.sensor) else {
             return;
         };
         if is_evident {
             sensor
                 .coverage
-                .learn(&look.place, look.state, is_hit, exists);
+                .learn(&observation.place, observation.state, is_hit, exists);
         }
-        sensor.clutter.learn(look.state, is_hit, 1.0 - exists);
-        if let Some(detection) = look.detection.map(|number| &scan.detections[number]) {
+        sensor
+            .clutter
+            .learn(observation.state, is_hit, 1.0 - exists);
+        if let Some(detection) = observation.detection.map(|number| &scan.detections[number]) {
             sensor.calibration.learn(detection.log_odds, exists);
         }
     }
@@ -444,12 +462,12 @@ impl InstantUpdate<'_> {
     /// Judges a vehicle's statement about a track by the evidence of the other vehicles.
     fn judge(
         &mut self,
-        look: &Look,
+        observation: &Observation,
         vehicle: SensorId,
         statement: ExistenceStatement,
         evidence: &mut Vec<Evidence>,
     ) {
-        let track = &self.tracks[look.track];
+        let track = &self.tracks[observation.track];
         let label = track.label(self.config);
         let (sensor, fleet) = match self.sensors.with_fleet(vehicle) {
             Some(both) => both,
@@ -458,13 +476,13 @@ impl InstantUpdate<'_> {
         let distance_m = sensor
             .coverage
             .centre()
-            .map_or(0.0, |centre| (look.place - centre).norm());
-        let judgement = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
+            .map_or(0.0, |centre| (observation.place - centre).norm());
+        let judged = fleet.judge(vehicle, statement, &track.history, distance_m, self.at);
         let is_shifted = || {
             let mut histories = track.history.iter();
             histories.any(|history| history.sensor == vehicle && history.is_shifted)
         };
-        let judgement = match judgement {
+        let judgement = match judged {
             None => return,
             Some(Judgement::Correct) if is_shifted() => Judgement::Shifted,
             Some(judgement) => judgement,
@@ -479,11 +497,11 @@ impl InstantUpdate<'_> {
     }
 
     /// Compares a vehicle's detections with the objects that other cells state, and judges these cells.
-    fn look_at_foreign(&mut self, scan: &Scan<'_>) {
+    fn judge_neighbours(&mut self, scan: &Scan<'_>) {
         let id = scan.sensor;
         let at = self.at;
         let gate = self.config.gate();
-        let Some(sensor) = self.sensors.get(id).filter(|_| !self.foreign.is_empty()) else {
+        let Some(sensor) = self.sensors.get(id).filter(|_| !self.neighbours.is_empty()) else {
             return;
         };
         let Some(centre) = sensor.coverage.centre() else {
@@ -493,7 +511,7 @@ impl InstantUpdate<'_> {
         let near_m = 2.0 * self.config.gate_m;
         let is_in_view = |place: &Vector2<f64>| sensor.coverage.rates_at(place).is_some();
         // Objects outside the view must not use up the limit per cell.
-        let is_looked_at = |place: &Vector2<f64>| {
+        let is_observed = |place: &Vector2<f64>| {
             let is_within = (place - centre).norm() <= reach_m;
             let mut places = scan
                 .detections
@@ -501,11 +519,11 @@ impl InstantUpdate<'_> {
                 .map(|detection| detection.measurement.position);
             is_within && (is_in_view(place) || places.any(|other| (other - place).norm() <= near_m))
         };
-        for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
-            let position = foreign.state.position_at(at);
-            let state = foreign.history.state_of(id);
+        for neighbour in self.neighbours.stated(MAX_NEIGHBOURS_EACH, at, is_observed) {
+            let position = neighbour.state.position_at(at);
+            let state = neighbour.history.state_of(id);
             let near = scan.detections.iter().filter(|detection| {
-                let innovation = foreign.state.innovation(at, &detection.measurement);
+                let innovation = neighbour.state.innovation(at, &detection.measurement);
                 // The position of the object is as old as its cell's map.
                 innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
             });
@@ -514,16 +532,16 @@ impl InstantUpdate<'_> {
                 .max_by(f64::total_cmp);
             if let Some(confidence) = confidence {
                 let nats = sensor.hit_rates(&position, state).nats(true);
-                if let Some(history) = foreign.history.for_hit(id, at) {
+                if let Some(history) = neighbour.history.for_hit(id, at) {
                     history.hit(at, position, nats, confidence);
                 }
-            } else if let Some(rates) = sensor.look_rates(&position, state)
-                && let Some(history) = foreign.history.for_look(id, at)
+            } else if let Some(rates) = sensor.observation_rates(&position, state)
+                && let Some(history) = neighbour.history.for_observation(id, at)
             {
                 history.miss(at, &rates);
             }
         }
-        self.foreign.judge(&self.sensors.fleet, at);
+        self.neighbours.judge(&self.sensors.fleet, at);
     }
 
     /// A new track at a measurement of object `index` of a report. The track continues an object of a neighbouring cell
@@ -539,12 +557,12 @@ impl InstantUpdate<'_> {
         let config = self.config;
         let fleet = &self.sensors.fleet;
         match self
-            .foreign
+            .neighbours
             .find(at, measurement, detected, self.tracks, fleet, config)
         {
-            Some(foreign) => {
-                let track = foreign.lend(at, measurement, config);
-                self.foreign.hand_overs.begun += 1;
+            Some(neighbour) => {
+                let track = neighbour.lend(at, measurement, config);
+                self.neighbours.hand_overs.begun += 1;
                 track
             }
             None => {
@@ -589,7 +607,7 @@ impl InstantUpdate<'_> {
             let nats = if number == 0 {
                 0.0
             } else {
-                let rates = sensor.hit_rates(&detection.reported, LookState::First);
+                let rates = sensor.hit_rates(&detection.reported, ObservationState::First);
                 rates.nats(true)
             };
             log_odds += scan.trust * nats;
@@ -606,11 +624,11 @@ impl InstantUpdate<'_> {
             let Some(sensor) = self.sensors.get(scan.sensor) else {
                 continue;
             };
-            let rates = sensor.look_rates(&position, LookState::First);
+            let rates = sensor.observation_rates(&position, ObservationState::First);
             if let Some(rates) = rates {
                 let nats = rates.nats(false);
                 log_odds += scan.trust * nats;
-                if let Some(history) = track.history.for_look(scan.sensor, at) {
+                if let Some(history) = track.history.for_observation(scan.sensor, at) {
                     history.miss(at, &rates);
                     if !scan.occlusion.hides(&position) {
                         history.deny(&rates);

@@ -102,7 +102,7 @@ impl ConfidenceCalibration {
     }
 
     /// Removes the confidences of vehicles, whose indices may be reused.
-    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+    pub(super) fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
             if let Some(histogram) = self.histograms.get_mut(vehicle) {
                 *histogram = ConfidenceHistogram::default();

@@ -76,7 +76,7 @@ impl Confusion {
     }
 
     /// Removes all evidence about any of `labels`.
-    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+    pub(super) fn remove_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         let is_kept = |label| !labels.contains(&label);
         self.columns.retain(|stated, _| is_kept(stated));
         for column in self.columns.values_mut() {
@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn forgotten_label_leaves_rest_unchanged() {
+    fn removed_label_leaves_rest_unchanged() {
         let mut confusion = Confusion::default();
         let mut without = Confusion::default();
         for (truth, stated, weight) in [
@@ -161,7 +161,7 @@ mod tests {
                 without.add(stated, [(truth, 1.0)], weight);
             }
         }
-        confusion.forget_labels(&[1].into());
+        confusion.remove_labels(&[1].into());
         assert_eq!(confusion, without);
     }
 

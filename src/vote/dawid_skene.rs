@@ -120,7 +120,7 @@ impl ClassShares {
         self.set(label, (self.landmarks[label] + landmarks).max(1.0));
     }
 
-    fn forget(&mut self, label: LabelIndex) {
+    fn remove(&mut self, label: LabelIndex) {
         self.set(usize::from(label), 1.0);
     }
 
@@ -200,13 +200,13 @@ impl DawidSkene {
     }
 
     /// Removes labels that do not occur in the live evidence; their indices may be reused.
-    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
-        labels.iter().for_each(|label| self.shares.forget(*label));
+    pub(super) fn remove_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+        labels.iter().for_each(|label| self.shares.remove(*label));
         self.vehicles
             .iter_mut()
             .flat_map(|w| [&mut w.live, &mut w.settled, &mut w.inherited])
-            .for_each(|c| c.forget_labels(labels));
-        self.label_bias.forget_labels(labels);
+            .for_each(|c| c.remove_labels(labels));
+        self.label_bias.remove_labels(labels);
     }
 
     fn wrong_labels(&self) -> f64 {

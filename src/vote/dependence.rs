@@ -137,7 +137,7 @@ impl Dependence {
     }
 
     /// Removes vehicles, whose indices may be reused.
-    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+    pub(super) fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         self.pairs
             .retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
         self.partners
@@ -156,7 +156,7 @@ impl Dependence {
     }
 
     /// Clears how often labels were stated; their indices may be reused.
-    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+    pub(super) fn remove_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for &label in labels {
             let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else {
                 continue;

@@ -183,7 +183,7 @@ impl LabelBias {
     }
 
     /// Removes vehicles, whose indices may be reused.
-    pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
+    pub(super) fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
             for preferences in [&mut self.vehicles, &mut self.inherited] {
                 if let Some(preferences) = preferences.get_mut(vehicle) {
@@ -195,7 +195,7 @@ impl LabelBias {
     }
 
     /// Removes labels, whose indices may be reused.
-    pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
+    pub(super) fn remove_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for preferences in self.vehicles.iter_mut().chain(&mut self.inherited) {
             preferences
                 .labels

@@ -78,7 +78,7 @@ impl LabelTable {
     }
 
     /// Clears which labels these vehicles stated first: their indices may be reused.
-    pub(super) fn forget_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
+    pub(super) fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         for entry in &mut self.entries {
             entry.introduced_by = entry.introduced_by.filter(|by| !vehicles.contains(by));
         }

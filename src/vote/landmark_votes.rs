@@ -70,7 +70,7 @@ impl RecentStatements {
     }
 
     /// Removes statements of labels whose indices may be reused.
-    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
+    pub(super) fn remove_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
         for (label, sum) in self.labels.iter_mut().zip(&mut self.sums) {
             if is_gone(*label) {
                 *label = 0;
@@ -253,7 +253,7 @@ impl LandmarkVotes {
 
     /// Removes labels with the votes for them; returns the number of votes. Not allowed while they
     /// are counted.
-    pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
+    pub(super) fn remove_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
         let votes = self.votes.len();
         self.votes.retain(|vote| !is_gone(vote.label));
         self.posterior.retain(|(label, _)| !is_gone(*label));

@@ -266,7 +266,7 @@ fn fresh_reading_outweighs_misses() {
 }
 
 #[test]
-fn a_silent_vehicle_is_forgotten() {
+fn silent_vehicle_is_dropped() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     pace.observe(&report("a", vec![object("car", 0.9, 0.0, 0.0)], &[]), START);
     assert_eq!(labels(&pace.close(frame(9)).landmarks), [Some("car")]);

@@ -355,24 +355,24 @@ impl Reader<'_> {
         self.imports.insert((self.module.clone(), target));
     }
 
-    fn note_tree(&mut self, before: &[String], tree: &syn::UseTree) {
+    fn record_tree(&mut self, before: &[String], tree: &syn::UseTree) {
         let with = |name: &syn::Ident| [before, &[name.to_string()]].concat();
         match tree {
-            syn::UseTree::Path(path) => self.note_tree(&with(&path.ident), &path.tree),
+            syn::UseTree::Path(path) => self.record_tree(&with(&path.ident), &path.tree),
             syn::UseTree::Name(name) => self.record(&with(&name.ident)),
             syn::UseTree::Rename(rename) => self.record(&with(&rename.ident)),
             syn::UseTree::Glob(_) => self.record(before),
             syn::UseTree::Group(group) => group
                 .items
                 .iter()
-                .for_each(|tree| self.note_tree(before, tree)),
+                .for_each(|tree| self.record_tree(before, tree)),
         }
     }
 }
 
 impl<'ast> Visit<'ast> for Reader<'_> {
     fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
-        self.note_tree(&[], &item.tree);
+        self.record_tree(&[], &item.tree);
     }
 
     fn visit_path(&mut self, path: &'ast syn::Path) {

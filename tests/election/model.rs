@@ -214,13 +214,13 @@ impl Cell {
             };
             node.clock = node.clock.max(machine.next_deadline());
             let effects = machine.handle(Input::Wake, node.clock);
-            if !effects.contains(&Effect::Look) {
+            if !effects.contains(&Effect::Observe) {
                 return effects;
             }
-            let (looks, others): (Vec<_>, Vec<_>) = effects
+            let (observes, others): (Vec<_>, Vec<_>) = effects
                 .into_iter()
-                .partition(|effect| matches!(effect, Effect::Look | Effect::AskParts));
-            self.carry_out(index, looks);
+                .partition(|effect| matches!(effect, Effect::Observe | Effect::AskParts));
+            self.carry_out(index, observes);
             if !others.is_empty() {
                 return others;
             }
@@ -263,13 +263,13 @@ impl Cell {
                 self.packets
                     .extend(known.map(|to| Packet::Election(to, message)));
             }
-            Effect::Look => {
+            Effect::Observe => {
                 let members = (0..nodes)
                     .filter(|peer| *peer != index)
                     .map(member)
                     .collect();
                 let rounds_due = node.clock.micros() / 100_000;
-                return Some(Input::Looked {
+                return Some(Input::Observed {
                     rounds_due,
                     load_percent: 0,
                     members,

@@ -5,8 +5,8 @@
 
 mod data_plane;
 mod evidence;
+mod false_reports;
 mod gaps;
-mod liar;
 mod logins;
 mod node;
 mod random;

@@ -442,14 +442,14 @@ mod tests {
         let detector = arguments(Slow(waits), &counters);
         let (detector, ended) = Actor::spawn(None, Detector, detector).await.unwrap();
         let until = async |is_slow: bool| {
-            let is_told = || {
+            let is_reported = || {
                 counters
                     .troubles()
                     .present()
                     .iter()
                     .any(|trouble| trouble.cause == SLOW_DETECTOR)
             };
-            while is_told() != is_slow {
+            while is_reported() != is_slow {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
         };

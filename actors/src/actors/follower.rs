@@ -285,7 +285,7 @@ impl FollowerState {
             ..
         } = accepted;
         if is_sign_of_life {
-            self.election.send(LeaderElectionMessage::Note {
+            self.election.send(LeaderElectionMessage::Record {
                 input: Input::RoundAccepted { epoch, round },
             });
         }

@@ -386,7 +386,7 @@ impl FuserState {
         };
         let node = report.node.as_str();
         let troubles = self.counters.troubles();
-        match self.aggregator.knows_location(id) {
+        match self.aggregator.has_location(id) {
             Some(true) => {}
             Some(false) => {
                 let cause = format!("names the location “{id}”, which this node does not have");

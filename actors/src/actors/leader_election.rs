@@ -139,7 +139,7 @@ impl Actor for LeaderElection {
             LeaderElectionMessage::TakeStatus { delivery } => {
                 driver.on_status(&delivery.message).await;
             }
-            LeaderElectionMessage::Note { input } => driver.handle(input).await,
+            LeaderElectionMessage::Record { input } => driver.handle(input).await,
         }
         Ok(())
     }

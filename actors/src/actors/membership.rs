@@ -115,7 +115,7 @@ impl Actor for Membership {
         let key = CellKey::load(&config, &cell)?;
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
-        log_who_can_take_part(&config, credentials.is_some(), address);
+        log_admission(&config, credentials.is_some(), address);
         let mut certificates = credentials.clone().map(CertificateWatch::new);
         let identity = certificates.as_mut().map(CertificateWatch::identity);
         let renewals = credentials
@@ -163,17 +163,17 @@ impl Actor for Membership {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
         }
         if !config.seeds.is_empty() {
-            let told = Arc::clone(&events);
+            let report = Arc::clone(&events);
             let trouble = move |seed: &str, error: &io::Error| {
                 let cause = format!("cannot be resolved: {error}");
-                told(MembershipEvent::Troubled {
+                report(MembershipEvent::Troubled {
                     about: seed.to_owned(),
                     kind: TroubleKind::Unresolved,
                     cause,
                 });
             };
             let membership = myself.clone();
-            let tell = move |addresses| {
+            let set_seeds = move |addresses| {
                 membership
                     .cast(MembershipMessage::SetSeeds { addresses })
                     .is_ok()
@@ -182,7 +182,7 @@ impl Actor for Membership {
                 config.seeds,
                 address.is_ipv4(),
                 trouble,
-                tell,
+                set_seeds,
             ));
         }
         members.send_replace(Vec::new());
@@ -292,7 +292,7 @@ impl MembershipState {
             let sent = match output {
                 GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
                 GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
-                GossipOutput::Tell(event) => {
+                GossipOutput::Event(event) => {
                     changed |= !matches!(
                         event,
                         MembershipEvent::Received { .. } | MembershipEvent::Troubled { .. }
@@ -377,9 +377,9 @@ impl MembershipState {
     /// Publishes the list of living members if it has changed.
     fn publish_members(&self) {
         let members = self.machine.members();
-        self.members.send_if_modified(|told| {
-            let has_changed = *told != members;
-            *told = members;
+        self.members.send_if_modified(|published| {
+            let has_changed = *published != members;
+            *published = members;
             has_changed
         });
     }
@@ -524,7 +524,7 @@ fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
     Ok((session, secret, u64::from_le_bytes(seed)))
 }
 
-fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
+fn log_admission(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     if config.has_key() && proves {
         tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
     } else if config.has_key() {

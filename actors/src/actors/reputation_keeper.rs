@@ -323,7 +323,7 @@ impl ReputationKeeperState {
             };
             self.arguments
                 .election
-                .send(LeaderElectionMessage::Note { input });
+                .send(LeaderElectionMessage::Record { input });
         }
         for reason in merged.refused {
             tracing::debug!(node = %share.node, %reason, term = leadership.term, "part of the evidence not used");
@@ -444,7 +444,7 @@ impl ReputationKeeperState {
             .ledger
             .retain_statements(|share| signer.is_trusted(share));
         if counted_under.is_some_and(|certificate| !signer.is_of_cell(&certificate)) {
-            has_dropped |= store.ledger.forget_own(&self.arguments.name);
+            has_dropped |= store.ledger.drop_own(&self.arguments.name);
         }
         if has_dropped {
             tracing::info!(

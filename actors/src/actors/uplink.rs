@@ -117,7 +117,7 @@ impl Actor for Uplink {
             myself.clone(),
         ));
         let mut state = UplinkState::new(arguments, watcher);
-        state.look(&myself);
+        state.update(&myself);
         Ok(state)
     }
 
@@ -128,7 +128,7 @@ impl Actor for Uplink {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            UplinkMessage::Look => state.look(&myself),
+            UplinkMessage::Update => state.update(&myself),
             UplinkMessage::Reconnect => {
                 if let Some(link) = &mut state.link {
                     link.reconnect(events_to(&myself));
@@ -190,7 +190,7 @@ impl UplinkState {
     }
 
     /// Connects, disconnects or publishes, depending on the leadership and the newest map.
-    fn look(&mut self, myself: &ActorRef<UplinkMessage>) {
+    fn update(&mut self, myself: &ActorRef<UplinkMessage>) {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
         match (leads, self.setup.origin) {
@@ -369,14 +369,14 @@ impl UplinkState {
         if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);
         }
-        self.look(myself);
+        self.update(myself);
     }
 
     /// Repeats the node's own status if a last will or a former leader has replaced it.
-    fn on_neighbour_status(&mut self, heard: &NodeStatus) {
+    fn on_neighbour_status(&mut self, status: &NodeStatus) {
         let own = self.own_status();
-        let is_former = (heard.epoch, &heard.node) < (own.epoch, &own.node);
-        if heard.state == NodeState::Offline || is_former {
+        let is_former = (status.epoch, &status.node) < (own.epoch, &own.node);
+        if status.state == NodeState::Offline || is_former {
             self.publish_status();
         }
     }
@@ -457,7 +457,7 @@ async fn watch_cell(
             changed = leadership.changed() => changed,
             changed = newest.changed() => changed,
         };
-        if changed.is_err() || uplink.cast(UplinkMessage::Look).is_err() {
+        if changed.is_err() || uplink.cast(UplinkMessage::Update).is_err() {
             return;
         }
     }

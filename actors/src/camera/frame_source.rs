@@ -212,7 +212,7 @@ impl SourceConfig {
     }
 
     /// Removes user and password from an address or a pipeline; the key if there were any.
-    pub(crate) fn forget_credentials(&mut self) -> Option<&'static str> {
+    pub(crate) fn remove_credentials(&mut self) -> Option<&'static str> {
         let bare = self.origin();
         let (key, text) = match self {
             Self::Url { url } => ("url", url),

@@ -270,10 +270,10 @@ impl Perception {
             .sizes
             .of(&detection.label)
             .map(|size| size.width_m);
-        let target = corners
+        let located = corners
             .zip(side_m)
             .map(|(c, side)| locate_target(&c, side, &self.vehicle_camera.lens.intrinsics));
-        let target = match target.transpose() {
+        let target = match located.transpose() {
             Ok(target) => target,
             Err(error) => {
                 tracing::debug!(label = %detection.label, %error, "cannot use corners");

@@ -134,7 +134,7 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
 async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     let shared = SharedConfig::parse(text).map_err(Failure::usage)?;
     let places = shared.landmarks.len();
-    let cost = shared.cost();
+    let estimate = shared.cost();
     let CellDescription {
         version,
         hash,
@@ -143,7 +143,7 @@ async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     } = client.set(text).await?;
     let cost = format!(
         "maps of up to {} bytes, {:.0} bytes/s",
-        cost.map_bytes, cost.bytes_per_s
+        estimate.map_bytes, estimate.bytes_per_s
     );
     Ok(print(&format!(
         "version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"

@@ -225,7 +225,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         let reached: Vec<String> = addresses.iter().map(ToString::to_string).collect();
         eprintln!("waiting at {}; the tokens end with this command", reached.join(", "));
         let until = Instant::now() + Duration::from_secs(u64::from(arguments.hours) * 3600);
-        let tell = |visit| match visit {
+        let report_visit = |visit| match visit {
             Visit::Joined(node) => eprintln!("{node} has joined"),
             Visit::UsedAgain(node) => eprintln!(
                 "the token of {node} was used twice: the certificate of the first is revoked, copy {} to all nodes. If \
@@ -234,7 +234,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
             ),
             Visit::Failed(from, reason) => eprintln!("{from} has not joined: {reason}"),
         };
-        anyhow::Ok(host.serve(listener, until, tell).await)
+        anyhow::Ok(host.serve(listener, until, report_visit).await)
     })?;
     if left.is_empty() {
         return Ok(());

@@ -54,11 +54,11 @@ pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
             .with_context(|| file.path().display().to_string())?;
         done += &format!("reset {}\n", file.path().display());
     }
-    let forgotten = [
+    let removed = [
         (arguments.term, "term"),
         (arguments.description, "description"),
     ];
-    for (_, what) in forgotten.into_iter().filter(|(is_asked, _)| *is_asked) {
+    for (_, what) in removed.into_iter().filter(|(is_asked, _)| *is_asked) {
         let file = file(what);
         file.delete()
             .with_context(|| file.path().display().to_string())?;

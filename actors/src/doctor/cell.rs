@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(4);
 
 /// Time for which an observer that follows a leader stays: greetings of other cells and the cell's
 /// time arrive within it.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Checks that nodes of the cell answer, and compares this machine's clock with theirs. If no other
 /// node was found, this check is skipped.
@@ -52,7 +52,7 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
         sleep(Duration::from_millis(50)).await;
     }
     if node.leadership().borrow().leader().is_some() {
-        sleep(LOOK).await;
+        sleep(CHECK_PERIOD).await;
     }
     let findings = findings(config, &node);
     node.stop().await;

@@ -22,7 +22,7 @@ pub enum LeaderElectionMessage {
         delivery: Delivery<Arc<NodeStatus>>,
     },
     /// Something else happened at the node.
-    Note {
+    Record {
         /// Input of the state machine of the leadership.
         input: Input,
     },

@@ -11,7 +11,7 @@ use crate::transport::mqtt::{Delivery, FromRegion, LinkEvent};
 #[derive(Debug)]
 pub enum UplinkMessage {
     /// Check the leader and the newest map, because the leader or the map has changed.
-    Look,
+    Update,
     /// Replace the connection: it is from an address that this machine has lost.
     Reconnect,
     /// Publish this status of the node while it leads.

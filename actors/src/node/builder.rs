@@ -324,7 +324,7 @@ impl NodeBuilder {
                 let started =
                     Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
                 let id = slot(&self.slots.gateway, started)?;
-                self.slots.election.send(LeaderElectionMessage::Note {
+                self.slots.election.send(LeaderElectionMessage::Record {
                     input: Input::GatewayRestarted,
                 });
                 Ok(id)
@@ -345,7 +345,7 @@ impl NodeBuilder {
                 let started =
                     Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
                 let id = slot(&self.slots.fuser, started)?;
-                self.slots.election.send(LeaderElectionMessage::Note {
+                self.slots.election.send(LeaderElectionMessage::Record {
                     input: Input::FuserRestarted,
                 });
                 Ok(id)

@@ -27,7 +27,7 @@ impl HealthLog {
     /// Logs the counters that have changed since the last line; without a change there is no line.
     pub(super) fn log(&mut self, counters: &Counters, frames: &FrameCounters) {
         let snapshot = counters.snapshot();
-        let shed = counters.all_shed().into_iter().map(|shed| {
+        let counts = counters.all_shed().into_iter().map(|shed| {
             (
                 format!("{} {}", shed.reason.as_str(), shed.source),
                 shed.times,
@@ -35,7 +35,7 @@ impl HealthLog {
         });
         let events = changed(&mut self.events, named(snapshot.events));
         let rejects = changed(&mut self.rejects, named(snapshot.rejects));
-        let shed = changed(&mut self.shed, shed);
+        let shed = changed(&mut self.shed, counts);
         let frames = changed(&mut self.frames, named(frames.snapshot()));
         if [&events, &rejects, &shed, &frames]
             .iter()

@@ -26,7 +26,7 @@ use super::{NodeError, NodeHandle, NodeMessage, start_with};
 use crate::platform::clock;
 
 /// Time between two checks of the position.
-const LOOK_PERIOD: Duration = Duration::from_millis(200);
+const CHECK_PERIOD: Duration = Duration::from_millis(200);
 
 /// Age from which a pose is too old to be used.
 const MAX_POSE_AGE: Duration = Duration::from_secs(2);
@@ -109,13 +109,13 @@ impl Roamer {
     /// Always returns a [`NodeError`] with the reason, because a vehicle does not end successfully
     /// by itself.
     pub async fn drive(&mut self) -> Result<Infallible, NodeError> {
-        let mut looks = interval(LOOK_PERIOD);
-        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut checks = interval(CHECK_PERIOD);
+        checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 failed = self.present.failed() => failed?,
                 (cell, change) = next_change(&mut self.next) => self.change(&cell, change).await?,
-                _ = looks.tick() => self.look().await?,
+                _ = checks.tick() => self.check_position().await?,
             }
         }
     }
@@ -132,7 +132,7 @@ impl Roamer {
     }
 
     /// Processes the latest position, if there is one.
-    async fn look(&mut self) -> Result<(), NodeError> {
+    async fn check_position(&mut self) -> Result<(), NodeError> {
         let now = clock::now();
         let troubles = self.vehicle.counters.troubles();
         let place = self.place();

@@ -19,7 +19,7 @@ use sd_notify::NotifyState;
 pub struct ServiceManager {
     /// Timeout of the watchdog; `None` without a watchdog.
     watchdog: Option<Duration>,
-    told: Option<String>,
+    status: Option<String>,
     failing: bool,
 }
 
@@ -34,7 +34,7 @@ impl ServiceManager {
         std::env::var_os("NOTIFY_SOCKET")?;
         Some(Self {
             watchdog: sd_notify::watchdog_enabled(),
-            told: None,
+            status: None,
             failing: false,
         })
     }
@@ -48,33 +48,33 @@ impl ServiceManager {
 
     /// Notifies the manager that all parts of the node run.
     pub fn started(&mut self) {
-        self.tell(&[NotifyState::Ready]);
+        self.notify(&[NotifyState::Ready]);
     }
 
     /// Processes the node's readiness; feeds the watchdog unless a restart may help.
     pub fn beat(&mut self, readiness: Readiness) {
         if !readiness.needs_restart && self.watchdog.is_some() {
-            self.tell(&[NotifyState::Watchdog]);
+            self.notify(&[NotifyState::Watchdog]);
         }
-        if self.told.as_ref() != Some(&readiness.reason) {
-            self.tell(&[NotifyState::Status(&readiness.reason)]);
-            self.told = Some(readiness.reason);
+        if self.status.as_ref() != Some(&readiness.reason) {
+            self.notify(&[NotifyState::Status(&readiness.reason)]);
+            self.status = Some(readiness.reason);
         }
     }
 
     /// Notifies the manager that the node is about to end.
     pub fn stopping(&mut self) {
-        self.tell(&[NotifyState::Stopping]);
+        self.notify(&[NotifyState::Stopping]);
     }
 
     /// Sends news to the manager; if the manager does not listen, this is logged once.
-    fn tell(&mut self, news: &[NotifyState<'_>]) {
-        let told: io::Result<()> = sd_notify::notify(news);
-        if let Err(error) = &told
+    fn notify(&mut self, news: &[NotifyState<'_>]) {
+        let sent: io::Result<()> = sd_notify::notify(news);
+        if let Err(error) = &sent
             && !self.failing
         {
             tracing::warn!(%error, "cannot notify the service manager");
         }
-        self.failing = told.is_err();
+        self.failing = sent.is_err();
     }
 }

@@ -97,10 +97,10 @@ impl StateFile {
 
     /// Renames the file to `….set-aside`, with a warning that contains the reason.
     pub fn set_aside(&self, why: &str) {
-        let aside = self.path.with_extension("set-aside");
-        let failure = fs::rename(&self.path, &aside).err().map(display);
+        let aside_path = self.path.with_extension("set-aside");
+        let failure = fs::rename(&self.path, &aside_path).err().map(display);
         let path = self.path.display();
-        let aside = aside.display();
+        let aside = aside_path.display();
         tracing::warn!(
             %path, %aside, why, failure,
             "state set aside, the node goes on without it; to use a copy of yours, put it there while the node is stopped"

@@ -37,8 +37,8 @@ impl TokenBucket {
 
     /// Takes `count` tokens at once; returns false, without taking any, if there are fewer.
     pub(crate) fn allow_many(&mut self, count: u32, now: Timestamp) -> bool {
-        let earned = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
-        let earned = u32::try_from(earned).unwrap_or(u32::MAX);
+        let intervals = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
+        let earned = u32::try_from(intervals).unwrap_or(u32::MAX);
         self.refilled_at = if self.tokens.saturating_add(earned) >= self.burst {
             now
         } else {

@@ -173,8 +173,8 @@ mod tests {
             .unwrap();
         let visits = Arc::<Mutex<Vec<String>>>::default();
         let noted = Arc::clone(&visits);
-        let tell = move |visit| noted.lock().unwrap().push(format!("{visit:?}"));
-        let serving = tokio::spawn(host.serve(listener, Instant::now() + wait, tell));
+        let report = move |visit| noted.lock().unwrap().push(format!("{visit:?}"));
+        let serving = tokio::spawn(host.serve(listener, Instant::now() + wait, report));
         Scene {
             directory,
             token,

@@ -98,17 +98,17 @@ impl Watched {
             .insert(node.to_owned(), counters);
     }
 
-    fn forget(&mut self, node: &str) {
+    fn remove_counters(&mut self, node: &str) {
         self.counters.lock().unwrap().remove(node);
     }
 
     fn kill(&mut self, node: &str) {
-        self.forget(node);
+        self.remove_counters(node);
         self.cell.kill(node);
     }
 
     async fn stop(&mut self, node: &str) {
-        self.forget(node);
+        self.remove_counters(node);
         self.cell.stop_node(node).await;
     }
 

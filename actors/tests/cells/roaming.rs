@@ -387,7 +387,8 @@ async fn vehicle_reports_in_one_cell() {
     let logged = town.logged_cells();
     assert_eq!(logged, ["lot-0", "lot-1"], "one cell's maps at a time");
     let maps = [0, 1].map(|cell| town.accepted(cell));
-    let [last, next] = [maps[0].last().unwrap().0, maps[1][0].0];
+    let last = maps[0].last().unwrap().0;
+    let next = maps[1][0].0;
     let seam = next.since(last);
     println!("maps pause for {} ms", seam.as_millis());
     // Two periods, and a busy machine.

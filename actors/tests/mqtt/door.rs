@@ -200,7 +200,7 @@ async fn program_receives_all_messages() {
         ));
     }
     // A report reaches a door as soon as its node has subscribed to reports at the leader's broker.
-    let heard = |display: &Program, topic: &str| !display.heard_on(topic).is_empty();
+    let heard = |display: &Program, topic: &str| !display.received_on(topic).is_empty();
     let probed = async {
         for seq in 0.. {
             lidar.report("detections", "gauss--probe", seq, 0.0).await;
@@ -230,7 +230,7 @@ async fn program_receives_all_messages() {
                 .seq
         };
         display
-            .heard_on(&format!("detections/{reporter}"))
+            .received_on(&format!("detections/{reporter}"))
             .iter()
             .map(|heard| seq(&heard.payload))
             .collect()
@@ -318,9 +318,9 @@ async fn foreign_name_is_refused() {
             .iter()
             .find(|count| count.source == "mallory" && count.reason.as_str() == "not_permitted");
         assert_eq!(denied.map(|count| count.times), Some(5));
-        let statuses = program.heard_on(&format!("nodes/{name}/clients"));
+        let statuses = program.received_on(&format!("nodes/{name}/clients"));
         let late = Program::connect("late", cell.door(name), &["nodes/+/clients"]).await;
-        let retained = || late.heard_on(&format!("nodes/{name}/clients"));
+        let retained = || late.received_on(&format!("nodes/{name}/clients"));
         cell.until("the retained status", |_| !retained().is_empty())
             .await;
         for heard in [statuses.last().expect("a status"), &retained()[0]] {
@@ -332,13 +332,13 @@ async fn foreign_name_is_refused() {
             );
         }
         let forged = program
-            .heard_on("global_detections")
+            .received_on("global_detections")
             .iter()
             .any(|heard| heard.payload == payload("gauss"));
         assert!(
             !forged
                 && program
-                    .heard_on("nodes/gauss")
+                    .received_on("nodes/gauss")
                     .iter()
                     .all(|heard| heard.payload != payload("gauss"))
         );
@@ -370,7 +370,7 @@ async fn follower_port_accepts_votes() {
     let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
     let display = Program::connect("display", cell.door("noether"), &["global_verdicts"]).await;
     let is_voted = || {
-        let verdicts = display.heard_on("global_verdicts").into_iter();
+        let verdicts = display.received_on("global_verdicts").into_iter();
         let mut verdicts =
             verdicts.map(|heard| decode::<Verdicts>(&heard.payload, &Default::default()).unwrap());
         verdicts.any(|message| {

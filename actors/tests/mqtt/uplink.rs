@@ -46,7 +46,7 @@ async fn region_map_rate_is_limited() {
         let tile = Quadkey::of_cell(&ORIGIN);
         assert!(
             subscriber
-                .heard()
+                .received()
                 .iter()
                 .all(|heard| heard.topic.tile == tile)
         );
@@ -54,7 +54,10 @@ async fn region_map_rate_is_limited() {
         let late = Subscriber::new(&broker.address());
         let has_both = || late.status("north").is_some() && late.description("north").is_some();
         until("what is retained", async || has_both()).await;
-        let retained = late.heard().into_iter().filter(|heard| heard.is_retained);
+        let retained = late
+            .received()
+            .into_iter()
+            .filter(|heard| heard.is_retained);
         assert_eq!(retained.count(), 2, "maps are not kept");
         let status = late.status("north").unwrap();
         assert_eq!(

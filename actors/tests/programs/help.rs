@@ -5,6 +5,6 @@
 use ecod_testkit::help_of;
 
 #[test]
-fn of_every_command() {
+fn every_command_is_described() {
     insta::assert_snapshot!(help_of(env!("CARGO_BIN_EXE_ecod-node")));
 }

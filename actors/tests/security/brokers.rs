@@ -61,8 +61,10 @@ async fn vehicle_leaves_only_revoked_broker() {
         clock: Default::default(),
         counters: Arc::clone(&counters),
         subscriber: Arc::new(move |delivery| {
-            if let Incoming::Link { broker, state } = delivery.message {
-                sender.send((broker, state)).unwrap_or_default();
+            if let Incoming::Link { broker, state } = delivery.message
+                && let Err(error) = sender.send((broker, state))
+            {
+                eprintln!("after the test: {error}");
             }
         }),
         seed: 4,

@@ -40,12 +40,10 @@ fn seen_by(node: &Member) -> Vec<(String, Role)> {
 
 /// All declare to be an edge; other nodes use the roles that the certificates allow.
 #[tokio::test]
-async fn nodes_meet_only_with_certificates() {
+async fn nodes_join_only_with_certificates() {
     let mut pki = Pki::new();
-    let [edge, euclid] = [
-        pki.issue("edge", Role::Edge, DAY),
-        pki.issue("euclid", Role::Auto, DAY),
-    ];
+    let edge = pki.issue("edge", Role::Edge, DAY);
+    let euclid = pki.issue("euclid", Role::Auto, DAY);
     let edge = start("edge", Some(&edge), None).await;
     let bare = start("gauss", None, Some(edge.address)).await;
     let mut elsewhere = Pki::new();
@@ -83,10 +81,8 @@ async fn nodes_meet_only_with_certificates() {
 #[tokio::test]
 async fn revoked_node_goes_down_soon() {
     let mut pki = Pki::new();
-    let [edge, euclid] = [
-        pki.issue("edge", Role::Edge, DAY),
-        pki.issue("euclid", Role::Auto, DAY),
-    ];
+    let edge = pki.issue("edge", Role::Edge, DAY);
+    let euclid = pki.issue("euclid", Role::Auto, DAY);
     let edge = start("edge", Some(&edge), None).await;
     let euclid = start("euclid", Some(&euclid), Some(edge.address)).await;
     until("they meet", || {

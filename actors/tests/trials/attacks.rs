@@ -171,10 +171,11 @@ impl Attacker {
 
     /// Ends the attack; the result is the reason for which it ended before, if it failed.
     fn stop(self) -> Option<anyhow::Error> {
-        let fault = match self.task.is_finished() {
-            true => futures_util::FutureExt::now_or_never(self.task)
-                .and_then(|ended| ended.unwrap_or_else(|panic| Err(panic.into())).err()),
-            false => None,
+        let fault = if self.task.is_finished() {
+            futures_util::FutureExt::now_or_never(self.task)
+                .and_then(|ended| ended.unwrap_or_else(|panic| Err(panic.into())).err())
+        } else {
+            None
         };
         self.runtime.shutdown_background();
         fault

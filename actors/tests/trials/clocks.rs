@@ -27,7 +27,7 @@ const OTHERS_LOSS: Duration = Duration::from_millis(500);
 const DATE_ERROR: Duration = Duration::from_millis(500);
 
 /// One node's clock in one trial.
-struct Trial {
+struct Case {
     name: &'static str,
     /// The node, or the client `feeder`.
     whose: &'static str,
@@ -40,92 +40,92 @@ struct Trial {
 /// Time between two steps, and from the last one to the end.
 const STEP_TIME: Duration = Duration::from_secs(8);
 
-static TRIALS: [Trial; 15] = [
-    Trial {
+static CASES: [Case; 15] = [
+    Case {
         name: "vehicle 5 s ahead",
         whose: "euclid",
         start: Fake::Seconds(5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "vehicle 5 s behind",
         whose: "noether",
         start: Fake::Seconds(-5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "vehicle 7 min ahead",
         whose: "euclid",
         start: Fake::Seconds(420),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "vehicle a year behind",
         whose: "noether",
         start: Fake::Seconds(-31_536_000),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "vehicle in 1970, then set",
         whose: "noether",
         start: Fake::Year1970,
         steps: &[Fake::Seconds(0)],
     },
-    Trial {
+    Case {
         name: "vehicle steps 3 s back",
         whose: "euclid",
         start: Fake::Seconds(0),
         steps: &[Fake::Seconds(-3)],
     },
-    Trial {
+    Case {
         name: "vehicle steps 5 s ahead and back",
         whose: "noether",
         start: Fake::Seconds(0),
         steps: &[Fake::Seconds(5), Fake::Seconds(0)],
     },
-    Trial {
+    Case {
         name: "client steps 3 s back, then ahead",
         whose: "feeder",
         start: Fake::Seconds(0),
         steps: &[Fake::Seconds(-3), Fake::Seconds(0)],
     },
-    Trial {
+    Case {
         name: "client a year behind",
         whose: "feeder",
         start: Fake::Seconds(-31_536_000),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "leader 5 s ahead",
         whose: "edge",
         start: Fake::Seconds(5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "leader 5 s behind",
         whose: "edge",
         start: Fake::Seconds(-5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "leader a year behind",
         whose: "edge",
         start: Fake::Seconds(-31_536_000),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "leader in 1970, then set",
         whose: "edge",
         start: Fake::Year1970,
         steps: &[Fake::Seconds(0)],
     },
-    Trial {
+    Case {
         name: "leader steps 5 s ahead, 5 s back",
         whose: "edge",
         start: Fake::Seconds(0),
         steps: &[Fake::Seconds(5), Fake::Seconds(-5)],
     },
-    Trial {
+    Case {
         name: "leader steps to 1970 and back",
         whose: "edge",
         start: Fake::Seconds(0),
@@ -134,20 +134,20 @@ static TRIALS: [Trial; 15] = [
 ];
 
 /// Trials of cells with certificates, in which the client without a node takes no part.
-static TRIALS_WITH_CERTIFICATES: [Trial; 3] = [
-    Trial {
+static CASES_WITH_CERTIFICATES: [Case; 3] = [
+    Case {
         name: "certificates: vehicle 5 s behind",
         whose: "noether",
         start: Fake::Seconds(-5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "certificates: leader 5 s ahead",
         whose: "edge",
         start: Fake::Seconds(5),
         steps: &[],
     },
-    Trial {
+    Case {
         name: "certificates: leader steps 5 s back, 5 s ahead",
         whose: "edge",
         start: Fake::Seconds(0),
@@ -156,10 +156,10 @@ static TRIALS_WITH_CERTIFICATES: [Trial; 3] = [
 ];
 
 /// The edge starts last: with any clock, it takes over from a working leader.
-fn run(trial: &Trial) -> Outcome {
-    let has_certificates = TRIALS_WITH_CERTIFICATES
+fn run(case: &Case) -> Outcome {
+    let has_certificates = CASES_WITH_CERTIFICATES
         .iter()
-        .any(|other| other.name == trial.name);
+        .any(|other| other.name == case.name);
     let mut cell = if has_certificates {
         Cell::with_certificates()
     } else {
@@ -173,29 +173,29 @@ fn run(trial: &Trial) -> Outcome {
     let start = |cell: &mut Cell, name: &str| {
         cell.start(
             name,
-            if name == trial.whose {
-                trial.start
+            if name == case.whose {
+                case.start
             } else {
                 Fake::Off
             },
         );
     };
     let nodes = || VEHICLES.into_iter().filter(|name| *name != "feeder");
-    for name in nodes().filter(|name| *name != trial.whose) {
+    for name in nodes().filter(|name| *name != case.whose) {
         start(&mut cell, name);
     }
     if !has_certificates {
-        cell.feed(if trial.whose == "feeder" {
-            trial.start
+        cell.feed(if case.whose == "feeder" {
+            case.start
         } else {
             Fake::Off
         });
     }
-    let others = vehicles.iter().filter(|name| **name != trial.whose);
+    let others = vehicles.iter().filter(|name| **name != case.whose);
     cell.until("the others are used", |record| {
         others.clone().all(|name| record.has_lately([name]))
     });
-    if let Some(late) = nodes().find(|name| *name == trial.whose) {
+    if let Some(late) = nodes().find(|name| *name == case.whose) {
         let begun = cell.now();
         start(&mut cell, late);
         cell.until("it is used", |record| record.has_lately([late]));
@@ -203,7 +203,7 @@ fn run(trial: &Trial) -> Outcome {
         assert!(
             first.since(begun) <= START_TIME + OWN_LOSS,
             "{}: used {:?} after its start",
-            trial.name,
+            case.name,
             first.since(begun)
         );
     }
@@ -218,11 +218,11 @@ fn run(trial: &Trial) -> Outcome {
     cell.until("the edge leads", |record| record.source() == Some("edge"));
     let complete = cell.now() + OWN_LOSS;
     let mut until = cell.now() + STEP_TIME;
-    for step in trial.steps {
+    for step in case.steps {
         cell.until("time passes", |record| {
             record.last_at().is_some_and(|at| at > until)
         });
-        cell.set(trial.whose, *step);
+        cell.set(case.whose, *step);
         until = until + STEP_TIME;
     }
     cell.until("time passes", |record| {
@@ -230,7 +230,7 @@ fn run(trial: &Trial) -> Outcome {
     });
     let readiness = cell.readiness("edge");
     let is_full = |map: &Entry<'_>| vehicles.iter().all(|name| map.has(name));
-    let idle = match trial.whose {
+    let idle = match case.whose {
         "edge" | "feeder" => cell.longest_idle("edge", settled, is_full),
         vehicle => cell.longest_idle(vehicle, settled, |map| map.has(vehicle)),
     };
@@ -263,7 +263,7 @@ struct Outcome {
 }
 
 impl Outcome {
-    fn print(&self, trial: &Trial) {
+    fn print(&self, case: &Case) {
         let Self {
             maps,
             full,
@@ -278,53 +278,53 @@ impl Outcome {
             .collect();
         println!(
             "{:<46} {full:>4} of {maps:>4} maps have all; longest without {}; dates wrong by {:.3} s at most; ready and useless {} ms; edge: {readiness}",
-            trial.name,
+            case.name,
             losses.join(", "),
             dated.as_secs_f64(),
             idle.as_millis()
         );
     }
 
-    fn check(&self, trial: &Trial) {
+    fn check(&self, case: &Case) {
         for (name, loss) in &self.losses {
-            let may = if *name == trial.whose {
+            let may = if *name == case.whose {
                 OWN_LOSS
             } else {
                 OTHERS_LOSS
             };
-            assert!(*loss <= may, "{}: {loss:?} without {name}", trial.name);
+            assert!(*loss <= may, "{}: {loss:?} without {name}", case.name);
         }
         assert!(
             self.dated <= DATE_ERROR,
             "{}: dates wrong by {:?}",
-            trial.name,
+            case.name,
             self.dated
         );
         assert!(
             self.idle <= OWN_LOSS,
             "{}: ready and useless for {:?}",
-            trial.name,
+            case.name,
             self.idle
         );
     }
 }
 
-fn passes(trial: &Trial) {
-    let outcome = run(trial);
-    outcome.print(trial);
-    outcome.check(trial);
+fn passes(case: &Case) {
+    let outcome = run(case);
+    outcome.print(case);
+    outcome.check(case);
 }
 
 #[test]
 fn nodes_with_wrong_clocks_participate() {
-    for trial in TRIALS.iter().filter(|trial| {
+    for case in CASES.iter().filter(|case| {
         [
             "vehicle in 1970, then set",
             "leader steps 5 s ahead, 5 s back",
         ]
-        .contains(&trial.name)
+        .contains(&case.name)
     }) {
-        passes(trial);
+        passes(case);
     }
 }
 
@@ -382,17 +382,17 @@ fn certified_node_waits_for_clock() {
 #[ignore = "takes minutes: make clocks"]
 fn all() {
     let only = std::env::var("TRIAL").unwrap_or_default();
-    let tried = |trial: &'static Trial| {
-        let outcome = run(trial);
-        outcome.print(trial);
-        (trial, outcome)
+    let tried = |case: &'static Case| {
+        let outcome = run(case);
+        outcome.print(case);
+        (case, outcome)
     };
-    let trials = TRIALS
+    let cases = CASES
         .iter()
-        .chain(&TRIALS_WITH_CERTIFICATES)
-        .filter(|trial| trial.name.contains(&only));
-    let outcomes: Vec<_> = trials.map(tried).collect();
+        .chain(&CASES_WITH_CERTIFICATES)
+        .filter(|case| case.name.contains(&only));
+    let outcomes: Vec<_> = cases.map(tried).collect();
     outcomes
         .iter()
-        .for_each(|(trial, outcome)| outcome.check(trial));
+        .for_each(|(case, outcome)| outcome.check(case));
 }

@@ -313,8 +313,9 @@ fn one_command_restores_expired_node() {
     let_end(&pki, "edge", Role::Edge, machines[0].path());
     let_end(&pki, "gauss", Role::Auto, machines[1].path());
 
-    let [config, directory] = [machines[0].path().join("node.toml"), pki];
-    let [config, directory] = [&config, &directory].map(|path| path.to_str().unwrap());
+    let config_path = machines[0].path().join("node.toml");
+    let config = config_path.to_str().unwrap();
+    let directory = pki.to_str().unwrap();
     let said = succeeds(&["pki", "renew", "--config", config, "--dir", directory]);
     assert!(said.contains("renewed the certificate of edge"), "{said}");
     let (_host, tokens) = invite(edge, &gossip, &["gauss"]);

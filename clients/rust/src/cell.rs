@@ -482,7 +482,7 @@ impl<M> Iterator for Messages<M> {
     /// Waits for the next message. After an error, iteration may continue.
     fn next(&mut self) -> Option<Self::Item> {
         let began = Instant::now();
-        let mut is_told = false;
+        let mut is_reported = false;
         let mut state = self.shared.state();
         while !state.is_closing {
             // Subscribed again after a refusal.
@@ -512,8 +512,8 @@ impl<M> Iterator for Messages<M> {
             if self.timeout.is_some_and(|timeout| waited >= timeout) {
                 return Some(Err(Error::Silent(silence())));
             }
-            if waited >= SILENCE && !is_told {
-                is_told = true;
+            if waited >= SILENCE && !is_reported {
+                is_reported = true;
                 // Maps are expected without end, and a lost connection has a remedy; vehicles and
                 // other stations may be silent for good reason.
                 let is_fault = !state.is_connected() || self.filter.contains("/global_");

@@ -46,7 +46,7 @@ impl Sightings {
     pub(super) fn is_sighted(&self, [x_m, y_m]: [f64; 2], now: Instant) -> bool {
         let is_alone = self
             .foreign
-            .is_none_or(|heard| now.duration_since(heard) >= FOREIGN_FOR);
+            .is_none_or(|at| now.duration_since(at) >= FOREIGN_FOR);
         let mut recent = self
             .own
             .values()

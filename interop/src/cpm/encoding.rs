@@ -289,16 +289,16 @@ fn encode(
         .ok_or(CpmError::NoTime)?;
     let all = sources.len();
     sources.sort_by(|a, b| b.object.confidence.total_cmp(&a.object.confidence));
-    let mut objects: Vec<_> = sources
+    let mut perceived: Vec<_> = sources
         .iter()
         .filter_map(|source| source.perceived(frame))
         .collect();
-    objects.truncate(MAX_OBJECTS);
-    let left_out = all - objects.len();
+    perceived.truncate(MAX_OBJECTS);
+    let left_out = all - perceived.len();
     let number = cdd::CardinalNumber1B(u8::try_from(all).unwrap_or(u8::MAX));
     let objects = uper(&PerceivedObjectContainer::new(
         number,
-        PerceivedObjects(objects),
+        PerceivedObjects(perceived),
     ))?;
     let containers = vec![station, container(pdu::PERCEIVED_OBJECT_CONTAINER, objects)];
     let constrained = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(containers));

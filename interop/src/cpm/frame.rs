@@ -118,13 +118,13 @@ impl MessageFrame {
             longitude_deg,
             height_m,
         } = at;
-        let east = GeographicPose {
+        let east_pose = GeographicPose {
             latitude_deg,
             longitude_deg,
             height_m: Some(height_m),
             azimuth_deg: 90.0,
         };
-        let east = cell.pose_to_map(&east).map_err(|_| CpmError::TooFar)?;
+        let east = cell.pose_to_map(&east_pose).map_err(|_| CpmError::TooFar)?;
         let reference = GeographicOrigin {
             latitude_deg,
             longitude_deg,

@@ -286,9 +286,9 @@ pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), Re
         position,
         orientation,
     } = stamped.pose;
-    let ahead = orientation.rotation().map(|turn| turn * Vector3::x());
+    let turned = orientation.rotation().map(|turn| turn * Vector3::x());
     let bad = || InputRefusal::BadPose.with(format!("{stamped:?}"));
-    let ahead = ahead
+    let ahead = turned
         .filter(|_| stamped.header.frame_id == "map")
         .ok_or_else(bad)?;
     let pose = Pose::new(position.x, position.y, ahead.y.atan2(ahead.x));
@@ -416,7 +416,9 @@ impl ToMap {
                 .unwrap_or(0.0)
         });
         let turned = self.turn * stated * self.turn.transpose();
-        let [xx, xy, yy] = [turned.m11, turned.m12, turned.m22];
+        let xx = turned.m11;
+        let xy = turned.m12;
+        let yy = turned.m22;
         (xx > 0.0 && yy > 0.0).then_some([xx, xy, yy])
     }
 }

@@ -106,30 +106,29 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
     let directory = std::env::temp_dir().join(format!("ecod-doors-{}", std::process::id()));
     fs::create_dir_all(&directory)
         .with_context(|| format!("cannot make {}", directory.display()))?;
-    let edge = NodeConfig {
+    let edge_config = NodeConfig {
         landmarks: load::landmarks(),
         ..configuration("edge", Role::Edge)
     };
-    let mut edge = NodeProcess::start(program, &edge, &directory)?;
+    let mut edge = NodeProcess::start(program, &edge_config, &directory)?;
     let leader = serves(&mut edge).await?;
-    let mut vehicle = configuration(VEHICLE, Role::Cav);
-    vehicle.membership.seeds = vec![
+    let mut vehicle_config = configuration(VEHICLE, Role::Cav);
+    vehicle_config.membership.seeds = vec![
         timeout(PATIENCE, edge.address("looking for nodes"))
             .await??
             .to_string(),
     ];
-    let (resident_mb, door_mb) = idle_memory(program, &vehicle, &directory).await?;
+    let (resident_mb, door_mb) = idle_memory(program, &vehicle_config, &directory).await?;
     let map_log = directory.join("maps.jsonl");
-    vehicle.map_log = Some(map_log.clone());
-    let mut vehicle = NodeProcess::start(program, &vehicle, &directory)?;
+    vehicle_config.map_log = Some(map_log.clone());
+    let mut vehicle = NodeProcess::start(program, &vehicle_config, &directory)?;
     let door = serves(&mut vehicle).await?;
 
-    let [at_door, at_leader] = [
-        DoorWatcher::connect(door).await?,
-        DoorWatcher::connect(leader).await?,
-    ];
+    let at_door = DoorWatcher::connect(door).await?;
+    let at_leader = DoorWatcher::connect(leader).await?;
     at_door.first_map().await?;
-    let [mut report_at_door, mut report_at_leader] = [Latencies::default(), Latencies::default()];
+    let mut report_at_door = Latencies::default();
+    let mut report_at_leader = Latencies::default();
     for _ in 0..TURNS {
         let turn = duration / TURNS;
         report_at_leader.add(&report(leader, NODELESS, turn, &at_leader).await?);

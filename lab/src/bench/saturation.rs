@@ -71,12 +71,12 @@ pub struct Saturation {
 /// and the second try counts, because the machine may have hiccups.
 ///
 /// # Errors
-/// Returns the errors of [`measure`] and of `tell`.
+/// Returns the errors of [`measure`] and of `on_step`.
 pub async fn search(
     target: &Target,
     [least, most]: [usize; 2],
     duration: Duration,
-    tell: impl Fn(&Step) -> anyhow::Result<()>,
+    on_step: impl Fn(&Step) -> anyhow::Result<()>,
 ) -> anyhow::Result<Saturation> {
     let mut steps: Vec<Step> = Vec::new();
     let mut vehicles = least;
@@ -86,10 +86,10 @@ pub async fn search(
             ..Load::new(vehicles, duration)
         };
         let mut step = Step::new(vehicles, target, &measure(target, load).await?);
-        tell(&step)?;
+        on_step(&step)?;
         if !step.carried {
             step = Step::new(vehicles, target, &measure(target, load).await?);
-            tell(&step)?;
+            on_step(&step)?;
         }
         steps.push(step);
         let carried = steps

@@ -125,7 +125,7 @@ const PASSES: u64 = 4;
 const COST_VEHICLES: usize = 32;
 
 /// Time for which the vehicles report while a browser shows the page.
-const LOOK: Duration = Duration::from_secs(4);
+const PAGE_TIME: Duration = Duration::from_secs(4);
 
 /// The load at which the search begins.
 const SEARCH_FROM: usize = 4;
@@ -202,7 +202,7 @@ impl BenchArguments {
 
     /// The running cell to be measured, if one is given.
     fn running_cell(&self) -> anyhow::Result<Option<Target>> {
-        let config = self
+        let loaded = self
             .config
             .as_deref()
             .map(NodeConfig::load_cell)
@@ -210,16 +210,16 @@ impl BenchArguments {
         let named = self
             .connect
             .clone()
-            .or_else(|| config.as_ref()?.mqtt.broker.clone());
+            .or_else(|| loaded.as_ref()?.mqtt.broker.clone());
         let Some(broker) = named else {
-            if config.is_some() {
+            if loaded.is_some() {
                 bail!(
                     "the configuration names no `mqtt.broker`: give --connect HOST:PORT, the aggregator's"
                 );
             }
             return Ok(None);
         };
-        let config = config.unwrap_or_default();
+        let config = loaded.unwrap_or_default();
         if !config.fusion.algorithms.pace() {
             bail!("the benchmark needs maps: set `fusion.algorithms` to `pace` or `both`");
         }
@@ -280,7 +280,7 @@ async fn compare(
         let verdict = target.votes.then(|| Ways::of(&cell.verdict, &bare.verdict));
         for (answer, ways) in [("map", Some(&map)), ("verdict", verdict.as_ref())] {
             let Some(ways) = ways else { continue };
-            ways.tell(vehicles, answer, &mut rows);
+            ways.add_rows(vehicles, answer, &mut rows);
             figures.goal(
                 format!("vehicles_{vehicles}_{answer}_p50_ratio"),
                 ways.p50_ratio,
@@ -327,7 +327,7 @@ impl Ways {
         }
     }
 
-    fn tell(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
+    fn add_rows(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
         for (way, quantiles) in [("cell", self.cell), ("bare", self.bare)] {
             let Quantiles {
                 p50_us,
@@ -368,7 +368,7 @@ async fn saturate(
         "\nvehicles    map ms p50, p99   verdict ms p50, p99   missing  refused  late ms   map kB  verdict kB  ",
     )?;
     print("broker %  aggregator %  vehicles %\n")?;
-    let tell = |step: &Step| {
+    let print_step = |step: &Step| {
         let times = |latency: Option<Quantiles>| {
             let [p50, p99] = [
                 latency.map(|latency| latency.p50_us),
@@ -384,7 +384,8 @@ async fn saturate(
         let percent = |part: fn(AggregatorShares) -> f64| {
             watched.map_or("-".into(), |parts| format!("{:.0}", part(parts)))
         };
-        let [broker, fusion] = [percent(|parts| parts.broker), percent(|parts| parts.fusion)];
+        let broker = percent(|parts| parts.broker);
+        let fusion = percent(|parts| parts.fusion);
         print(&format!(
             "{:>8} {}    {} {missing:>9} {:>8} {:>8.1} {map_kb:>8.1} {verdict_kb:>11.1} {broker:>9} {fusion:>13} {:>11.0}\n",
             step.vehicles,
@@ -396,7 +397,7 @@ async fn saturate(
         ))
     };
     let most = usize::from(arguments.up_to);
-    let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, tell).await?;
+    let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, print_step).await?;
     let carried = found
         .most_vehicles
         .map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());
@@ -429,12 +430,12 @@ async fn costs(
         ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds))
     };
     let mut usages = Vec::new();
-    let mut page = None;
+    let mut viewed = None;
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
         let measured = measure(aggregator.target()?, load).await?;
         if !records {
-            page = Some(look(&mut aggregator).await?);
+            viewed = Some(page_figures(&mut aggregator).await?);
         }
         aggregator.stop().await;
         usages.push(measured.aggregator.context("the aggregator ended")?);
@@ -466,9 +467,9 @@ async fn costs(
         added,
         5.0,
     );
-    let page = page.context("the page was not measured")?;
-    let page_kb = page.bytes as f64 / 1e3;
-    let first_picture_ms = page.first_picture.as_secs_f64() * 1e3;
+    let viewed = viewed.context("the page was not measured")?;
+    let page_kb = viewed.bytes as f64 / 1e3;
+    let first_picture_ms = viewed.first_picture.as_secs_f64() * 1e3;
     print(&format!(
         "its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"
     ))?;
@@ -546,19 +547,19 @@ async fn doors(
 }
 
 /// Figures of the page as a browser gets it while the vehicles report.
-async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
+async fn page_figures(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
     let address = aggregator.page();
     let load = Load {
         bare: false,
-        ..Load::new(COST_VEHICLES, LOOK)
+        ..Load::new(COST_VEHICLES, PAGE_TIME)
     };
-    let looked = async {
-        tokio::time::sleep(LOOK / 2).await;
+    let viewed = async {
+        tokio::time::sleep(PAGE_TIME / 2).await;
         page::fetch(address).await
     };
-    let (measured, looked) = tokio::join!(measure(aggregator.target()?, load), looked);
+    let (measured, viewed) = tokio::join!(measure(aggregator.target()?, load), viewed);
     measured?;
-    looked
+    viewed
 }
 
 impl Figures {

@@ -144,7 +144,7 @@ impl Show<'_> {
         };
         let outcome = self
             .runtime
-            .block_on(until_signalled(demo.run(tell)))
+            .block_on(until_signalled(demo.run(print_progress)))
             .context("the street")?;
         print(&leaders(&outcome.terms, outcome.from, "objects"))?;
         Ok(outcome.result)
@@ -167,7 +167,7 @@ impl Show<'_> {
         ))?;
         let outcome = self
             .runtime
-            .block_on(until_signalled(demo.run(tell)))
+            .block_on(until_signalled(demo.run(print_progress)))
             .with_context(|| format!("scene {name}"))?;
         print(&format!(
             "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
@@ -197,7 +197,7 @@ struct DemoResults<'a> {
     street: Option<StreetResult>,
 }
 
-fn tell(progress: Progress) -> anyhow::Result<()> {
+fn print_progress(progress: Progress) -> anyhow::Result<()> {
     let news = match progress.news {
         News::Reports(reports) => format!("{reports} reports"),
         News::EdgeKilled => "the edge is killed".to_owned(),

@@ -19,9 +19,9 @@ use serde::Serialize;
 
 use super::write_json;
 use crate::testbed::intersection::line;
+use crate::testbed::scene_run::SceneRun;
 use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
-use crate::testbed::trial::Trial;
 use crate::testbed::{IntersectionRecording, Scene, Testbed};
 
 /// Flags of `testbed`.
@@ -99,21 +99,21 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     let mut results: Vec<SceneResult> = Vec::with_capacity(total);
     let start = Instant::now();
     for scene in scenes {
-        let trial = Trial {
+        let scene_run = SceneRun {
             testbed: &testbed,
             scene,
             verdicts: arguments.verdicts,
             seed: arguments.seed,
         };
-        let frames = trial.frames_per_verdict() * arguments.verdicts * scene.cavs.len() as u64;
+        let frames = scene_run.frames_per_verdict() * arguments.verdicts * scene.cavs.len() as u64;
         let bar = progress(frames, &scene.name);
-        let reports = trial
+        let reports = scene_run
             .reports(&|| bar.inc(1))
             .with_context(|| format!("scene {}", scene.name))?;
         if let Some(file) = &arguments.reports {
             write_reports(file, &reports)?;
         }
-        results.push(trial.run(&reports));
+        results.push(scene_run.run(&reports));
         bar.finish_and_clear();
         if let Some(result) = results.last().filter(|_| total > 1) {
             let left = start.elapsed() / results.len() as u32 * (total - results.len()) as u32;

@@ -244,7 +244,7 @@ async fn watch(
         check(nodes)?;
         let now = clock::now();
         let edge = &mut nodes[0];
-        let tell = |news| {
+        let report = |news| {
             progress(Progress {
                 elapsed: now.since(from),
                 news,
@@ -253,13 +253,13 @@ async fn watch(
         if played.killed_at.is_none() && now >= kill_at {
             edge.kill().await?;
             played.killed_at = Some(now);
-            tell(News::EdgeKilled)?;
+            report(News::EdgeKilled)?;
         } else if edge.is_killed() && now >= restart_at {
             edge.restart()?;
-            tell(News::EdgeStarted)?;
+            report(News::EdgeStarted)?;
         } else if now >= next_progress {
             next_progress = now + Duration::from_secs(1);
-            tell(News::Reports(collector.reports()))?;
+            report(News::Reports(collector.reports()))?;
         }
     }
     played.until = clock::now();

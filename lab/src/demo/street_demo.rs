@@ -37,7 +37,9 @@ use serde::Serialize;
 use super::judged_term::{JudgedTerm, judged_terms};
 use super::report_collector::ObservedReport;
 use super::stage::{Played, Progress, Stage};
-use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
+use crate::eval::tracks::{
+    DEFAULT_THRESHOLD, MATCH_DISTANCE_M, ReportedObject, ScoredFrame, score,
+};
 use crate::street::network_camera::{FRAMES_PER_S, NetworkCamera};
 use crate::street::{Carrier, Street, StreetCamera};
 
@@ -102,7 +104,7 @@ pub struct KnownShare {
 const STEP: Duration = Duration::from_millis(100);
 
 /// Age of a map from which on a node counts as having no objects.
-const FORGOTTEN: Duration = Duration::from_secs(1);
+const STALE_AFTER: Duration = Duration::from_secs(1);
 
 /// Time between two poses of a vehicle that drives.
 const POSE_PERIOD: Duration = Duration::from_millis(50);
@@ -427,7 +429,7 @@ impl Judge<'_> {
                 .take_while(|line| line.received_at <= at)
                 .count();
             let newest = next.checked_sub(1).map(|place| &maps[place]);
-            let known = newest.filter(|line| at.since(line.received_at) < FORGOTTEN);
+            let known = newest.filter(|line| at.since(line.received_at) < STALE_AFTER);
             frames.push(self.frame(at, known.map(|line| &*line.map), &mut ids));
             at = at + STEP;
         }
@@ -443,7 +445,7 @@ impl Judge<'_> {
         let said = map
             .into_iter()
             .flat_map(|map| &map.objects)
-            .map(|object| SaidObject::of(object, ids));
+            .map(|object| ReportedObject::of(object, ids));
         ScoredFrame {
             said: said.collect(),
             truth: self.street.truth(at.since(self.start).as_secs_f64()),

@@ -12,7 +12,7 @@ use ecod::model::time::Timestamp;
 use ecod::wire::ObjectReport;
 use nalgebra::{Point2, Vector2};
 
-use super::tracks::SaidObject;
+use super::tracks::ReportedObject;
 
 /// Age beyond which a vehicle's last report is not used.
 const MAX_AGE: Duration = Duration::from_millis(300);
@@ -111,7 +111,7 @@ struct NearestTrack {
 
 impl NearestTracker {
     /// Processes the objects present at a time.
-    pub fn track(&mut self, at: Timestamp, found: &[FoundObject]) -> Vec<SaidObject> {
+    pub fn track(&mut self, at: Timestamp, found: &[FoundObject]) -> Vec<ReportedObject> {
         self.tracks.retain(|track| at.since(track.at) <= PATIENCE);
         let mut pairs = Vec::new();
         for (number, track) in self.tracks.iter().enumerate() {
@@ -136,7 +136,7 @@ impl NearestTracker {
                 ids[place] = Some(self.tracks[number].follow(at, found[place].position));
             }
         }
-        let identified = found.iter().zip(ids).map(|(object, id)| SaidObject {
+        let identified = found.iter().zip(ids).map(|(object, id)| ReportedObject {
             id: id.unwrap_or_else(|| self.begin(at, object)),
             label: object.label.clone(),
             score: object.score,

@@ -61,7 +61,7 @@ pub struct ScoredFrame {
     /// True objects, each id once.
     pub truth: Vec<TrueObject>,
     /// Objects of the map, each id once.
-    pub said: Vec<SaidObject>,
+    pub said: Vec<ReportedObject>,
 }
 
 /// An object of the truth in one frame.
@@ -77,7 +77,7 @@ pub struct TrueObject {
 
 /// An object of a map in one frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct SaidObject {
+pub struct ReportedObject {
     /// Reported identity: a small number, used as a table index.
     pub id: u32,
     /// Reported class.
@@ -90,7 +90,7 @@ pub struct SaidObject {
     pub position: Point2<f64>,
 }
 
-impl SaidObject {
+impl ReportedObject {
     /// An object of a map; `ids` are the numbers given so far.
     pub fn of(object: &FusedObject, ids: &mut HashMap<Uuid, u32>) -> Self {
         let next = ids.len() as u32;
@@ -262,7 +262,7 @@ pub struct TrackEvaluation {
     truth: TrackTruth,
     reach_us: i64,
     /// By frame, the nearest map so far.
-    maps: Vec<Option<(Timestamp, Vec<SaidObject>)>>,
+    maps: Vec<Option<(Timestamp, Vec<ReportedObject>)>>,
     ids: HashMap<Uuid, u32>,
 }
 
@@ -281,16 +281,16 @@ impl TrackEvaluation {
     /// Processes the next map.
     pub fn map(&mut self, map: &GlobalMap) {
         let ids = &mut self.ids;
-        let said: Vec<SaidObject> = map
+        let said: Vec<ReportedObject> = map
             .objects
             .iter()
-            .map(|object| SaidObject::of(object, ids))
+            .map(|object| ReportedObject::of(object, ids))
             .collect();
-        self.said(map.fused_at_us, &said);
+        self.add_objects(map.fused_at_us, &said);
     }
 
     /// Adds objects reported at a time by any other program.
-    pub fn said(&mut self, at: Timestamp, said: &[SaidObject]) {
+    pub fn add_objects(&mut self, at: Timestamp, said: &[ReportedObject]) {
         let frames = self.truth.frames();
         let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
         let near = frames[first..]
@@ -309,7 +309,7 @@ impl TrackEvaluation {
 
     /// Returns the classes of the reported objects and of the truth if both sets are non-empty and
     /// disjoint.
-    pub fn labels_that_never_meet(&self) -> Option<(String, String)> {
+    pub fn labels_without_match(&self) -> Option<(String, String)> {
         let said: BTreeSet<&Label> = self
             .maps
             .iter()
@@ -369,7 +369,7 @@ impl TrackEvaluation {
     /// Adds the contents of a benchmark's files, frame by frame.
     pub fn sequences(&mut self, sequences: &[Sequence], frame_rate_hz: f64) {
         let times: Vec<Timestamp> = self.truth.frames().iter().map(|frame| frame.at).collect();
-        let mut said: BTreeMap<Timestamp, Vec<SaidObject>> =
+        let mut said: BTreeMap<Timestamp, Vec<ReportedObject>> =
             times.into_iter().map(|at| (at, Vec::new())).collect();
         let mut ids: HashMap<(usize, i64), u32> = HashMap::new();
         // Detections have no identity, so every detection gets a new one.
@@ -378,7 +378,7 @@ impl TrackEvaluation {
             for (frame, objects) in &sequence.frames {
                 let objects = objects.iter().map(|object| {
                     next += 1;
-                    SaidObject {
+                    ReportedObject {
                         id: object
                             .id
                             .map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
@@ -392,7 +392,7 @@ impl TrackEvaluation {
             }
         }
         for (at, objects) in &said {
-            self.said(*at, objects);
+            self.add_objects(*at, objects);
         }
     }
 }

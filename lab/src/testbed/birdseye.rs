@@ -310,7 +310,10 @@ impl BirdseyePicture<'_> {
             let seen = detections
                 .iter()
                 .filter(|(node, place)| *node == cav.name && self.sheet.holds(place));
-            let dots = seen.map(|(_, place)| dot(self.sheet.at(place)));
+            let dots = seen.map(|(_, place)| {
+                let (x, y) = self.sheet.at(place);
+                dot(x, y)
+            });
             dots.fold(
                 Group::new().set("fill", color).set("fill-opacity", 0.35),
                 Group::add,
@@ -538,7 +541,7 @@ fn line(x1: f64, y1: f64, x2: f64, y2: f64) -> Line {
         .set("y2", round(y2))
 }
 
-fn dot((x, y): (f64, f64)) -> Circle {
+fn dot(x: f64, y: f64) -> Circle {
     Circle::new()
         .set("cx", round(x))
         .set("cy", round(y))

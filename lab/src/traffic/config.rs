@@ -44,7 +44,7 @@ pub struct TrafficConfig {
     /// Sensors of the observers.
     pub sensor: SensorConfig,
     /// Optional parts of reports, in addition to labels, confidences and positions.
-    pub said: SaidConfig,
+    pub said: ReportedFields,
 }
 
 /// Sensor of an observer and its errors.
@@ -86,7 +86,7 @@ pub struct SensorConfig {
 /// Optional parts of reports, in addition to labels, confidences and positions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct SaidConfig {
+pub struct ReportedFields {
     /// Their poses. Default true.
     pub poses: bool,
     /// Covariances of positions, without biases and pose errors, as detectors do. Default true.
@@ -120,7 +120,7 @@ impl Default for TrafficConfig {
             synchronous: false,
             memory_s: 1.0,
             sensor: SensorConfig::default(),
-            said: SaidConfig::default(),
+            said: ReportedFields::default(),
         }
     }
 }
@@ -146,7 +146,7 @@ impl Default for SensorConfig {
     }
 }
 
-impl Default for SaidConfig {
+impl Default for ReportedFields {
     fn default() -> Self {
         Self {
             poses: true,
@@ -177,11 +177,11 @@ impl TrafficConfig {
                 lures: 0.4,
                 ..SensorConfig::default()
             },
-            said: SaidConfig {
+            said: ReportedFields {
                 poses: false,
                 covariances: false,
                 views: false,
-                ..SaidConfig::default()
+                ..ReportedFields::default()
             },
             ..Self::default()
         }
@@ -230,7 +230,7 @@ impl TrafficConfig {
         check_range("duration_s", self.duration_s, 0.1, 3600.0)?;
         check_range("warm_up_s", self.warm_up_s, 0.0, 3600.0)?;
         check_range("memory_s", self.memory_s, 0.0, 3600.0)?;
-        let SaidConfig {
+        let ReportedFields {
             velocities_mps,
             headings_rad,
             sizes_m,

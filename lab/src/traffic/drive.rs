@@ -203,7 +203,9 @@ impl MovingVehicle {
                 let at = roads
                     .next(from, heading)
                     .expect("every lane leads to a crossing");
-                let [straight, left, right] = [heading, (heading + 1) % 4, (heading + 3) % 4];
+                let straight = heading;
+                let left = (heading + 1) % 4;
+                let right = (heading + 3) % 4;
                 let wishes = match self.route[self.crossed % self.route.len()] {
                     0 | 1 => [straight, right, left],
                     2 => [right, straight, left],

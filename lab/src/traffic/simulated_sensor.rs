@@ -10,7 +10,7 @@ use ecod::model::geometry::{Covariance, Pose, wrap_angle};
 use ecod::wire::{FieldOfView, ObjectReport, PerceivedObject};
 use nalgebra::{Point2, Vector2};
 
-use super::config::{SaidConfig, TrafficConfig};
+use super::config::{ReportedFields, TrafficConfig};
 use super::dice::{Dice, Drift};
 use super::sight::{Sight, TrafficBody};
 
@@ -294,7 +294,7 @@ impl SimulatedSensor {
 
 /// Reported motion and size of an object, in a rotated frame; a false alarm seems to stand.
 fn describe(
-    said: &SaidConfig,
+    said: &ReportedFields,
     object: &mut PerceivedObject,
     body: Option<&TrafficBody>,
     turned_rad: f64,

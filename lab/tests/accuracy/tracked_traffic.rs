@@ -9,7 +9,8 @@ use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
 use ecod_lab::eval::baselines::{LatestReports, NearestTracker, found, suppressed};
 use ecod_lab::eval::tracks::{TrackEvaluation, TrackTruth};
 use ecod_lab::traffic::{
-    ArrivedReport, SaidConfig, SensorConfig, TrafficConfig, TrafficRecording, TruthFrame, generate,
+    ArrivedReport, ReportedFields, SensorConfig, TrafficConfig, TrafficRecording, TruthFrame,
+    generate,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -95,7 +96,7 @@ fn tracking_beats_late_fusion() {
             if let Some(map) = map {
                 ours.map(map);
                 let at = map.fused_at_us;
-                late.said(at, &tracker.track(at, &suppressed(latest.union(at))));
+                late.add_objects(at, &tracker.track(at, &suppressed(latest.union(at))));
             }
         });
         let figures = [ours, late].map(|judge| {
@@ -122,7 +123,7 @@ const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 
 /// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading
 /// is not known to 0.15 rad, and mean error of length in metres, where it is known.
-fn errors(said: SaidConfig) -> [f64; 3] {
+fn errors(said: ReportedFields) -> [f64; 3] {
     let recording = recording_of(&TrafficConfig {
         observers: 6,
         duration_s: 8.0,
@@ -193,12 +194,12 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
 
 #[test]
 fn stated_velocities_headings_sizes_improve_maps() {
-    let plain = errors(SaidConfig::default());
-    let rich = SaidConfig {
+    let plain = errors(ReportedFields::default());
+    let rich = ReportedFields {
         velocities_mps: Some(0.6),
         headings_rad: Some(0.1),
         sizes_m: Some(0.3),
-        ..SaidConfig::default()
+        ..ReportedFields::default()
     };
     let rich = errors(rich);
     assert!(
@@ -238,7 +239,7 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
                 NearestTracker::default(),
             )
         });
-        judge.said(
+        judge.add_objects(
             report.captured_at_us,
             &tracker.track(report.captured_at_us, &found(report)),
         );
@@ -263,7 +264,7 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
                 ours.map(map);
                 let at = map.fused_at_us;
                 if align {
-                    late.said(at, &tracker.track(at, &suppressed(latest.union(at))));
+                    late.add_objects(at, &tracker.track(at, &suppressed(latest.union(at))));
                 }
             }
         });
@@ -298,7 +299,7 @@ fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
     let config = TrafficConfig {
         fixed: true,
         duration_s: 20.0,
-        said: SaidConfig::default(),
+        said: ReportedFields::default(),
         sensor,
         ..recording
     };

@@ -26,8 +26,19 @@ pub(crate) struct Cluster {
 
 struct Server {
     child: Child,
-    /// For cells; the servers' own; for NATS's protocol; for figures.
-    addresses: [SocketAddr; 4],
+    addresses: ServerAddresses,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct ServerAddresses {
+    /// For cells.
+    mqtt: SocketAddr,
+    /// For the other servers.
+    route: SocketAddr,
+    /// For NATS's protocol.
+    clients: SocketAddr,
+    /// For figures.
+    monitor: SocketAddr,
 }
 
 const DEPLOY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/region");
@@ -60,19 +71,19 @@ impl Cluster {
             "mqtt { listen: $REGION_MQTT }\n",
         )?;
         fs::write(directory.join("cluster-tls.conf"), "")?;
-        let addresses: Vec<[SocketAddr; 4]> = (0..SERVERS)
+        let addresses: Vec<ServerAddresses> = (0..SERVERS)
             .map(|_| {
-                Ok([
-                    free_address()?,
-                    free_address()?,
-                    free_address()?,
-                    free_address()?,
-                ])
+                Ok(ServerAddresses {
+                    mqtt: free_address()?,
+                    route: free_address()?,
+                    clients: free_address()?,
+                    monitor: free_address()?,
+                })
             })
             .collect::<anyhow::Result<_>>()?;
         let routes: Vec<_> = addresses
             .iter()
-            .map(|[_, route, ..]| format!("\"nats://{route}\""))
+            .map(|server| format!("\"nats://{}\"", server.route))
             .collect();
         fs::write(
             directory.join("routes.conf"),
@@ -93,14 +104,14 @@ impl Cluster {
     pub(crate) fn addresses(&self) -> Vec<SocketAddr> {
         self.servers
             .iter()
-            .map(|server| server.addresses[0])
+            .map(|server| server.addresses.mqtt)
             .collect()
     }
 
     /// The login of one of the region's own users.
     pub(crate) fn login(&self, server: usize, user: &str) -> BrokerLogin {
         let secret = read_secret(&self.directory.join("passwords").join(user));
-        let address = BrokerAddress::from(self.servers[server].addresses[0]);
+        let address = BrokerAddress::from(self.servers[server].addresses.mqtt);
         BrokerLogin::plain(
             address,
             user,
@@ -144,12 +155,11 @@ impl Drop for Cluster {
     }
 }
 
-fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow::Result<Child> {
+fn spawn(directory: &Path, number: usize, addresses: &ServerAddresses) -> anyhow::Result<Child> {
     let log = fs::File::options()
         .create(true)
         .append(true)
         .open(directory.join(format!("server-{number}.log")))?;
-    let [mqtt, route, clients, monitor] = addresses.map(|address| address.to_string());
     // The servers end with this program, however that ends.
     Command::new("setpriv")
         .args([
@@ -161,10 +171,10 @@ fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow
         ])
         .current_dir(directory)
         .env("REGION_SERVER", format!("region-{}", number + 1))
-        .env("REGION_MQTT", mqtt)
-        .env("REGION_CLUSTER", route)
-        .env("REGION_CLIENTS", clients)
-        .env("REGION_MONITOR", monitor)
+        .env("REGION_MQTT", addresses.mqtt.to_string())
+        .env("REGION_CLUSTER", addresses.route.to_string())
+        .env("REGION_CLIENTS", addresses.clients.to_string())
+        .env("REGION_MONITOR", addresses.monitor.to_string())
         .env("REGION_DATA", directory.join(format!("data-{number}")))
         .stdin(Stdio::null())
         .stdout(Stdio::null())

@@ -234,11 +234,11 @@ impl City {
             .into_iter()
             .map(Meter::start)
             .collect::<Vec<_>>();
-        let sent = self.fleet.sent();
+        let sent_before = self.fleet.sent();
         let begun = Instant::now();
         std::thread::sleep(Duration::from_secs(seconds));
         let span = begun.elapsed().as_secs_f64();
-        let sent = (self.fleet.sent() - sent) as f64 / span;
+        let sent = (self.fleet.sent() - sent_before) as f64 / span;
         println!("  {seconds} s: simulated cells send {sent:.0} maps/s");
         let mut engine = (0.0, 0.0);
         for (number, meter) in meters.iter().enumerate() {

@@ -56,7 +56,9 @@ impl RealCells {
         };
         let Some(node) = node else { return Ok(cells) };
         for Place { cell, origin } in places {
-            let [line, listen, gossip] = [free_address()?, free_address()?, free_address()?];
+            let line = free_address()?;
+            let listen = free_address()?;
+            let gossip = free_address()?;
             let config = format!(
                 "name = \"edge\"\ncell = \"{cell}\"\nrole = \"edge\"\nlisten = \"{listen}\"\n\
                  [fusion]\nalgorithms = \"pace\"\n[membership]\nbind = \"{gossip}\"\nmulticast.enabled = false\n\

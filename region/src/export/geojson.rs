@@ -57,10 +57,10 @@ pub fn geojson(town: &RegionTown, bounds: &GeographicBounds, now: Timestamp) -> 
 }
 
 fn feature(kind: &str, geometry: &str, coordinates: &Value, properties: Value) -> Value {
-    let mut told = Map::from_iter([("kind".to_owned(), json!(kind))]);
+    let mut members = Map::from_iter([("kind".to_owned(), json!(kind))]);
     if let Value::Object(properties) = properties {
         // The geometry has them.
-        told.extend(
+        members.extend(
             properties
                 .into_iter()
                 .filter(|(name, _)| !["latitude_deg", "longitude_deg"].contains(&&**name)),
@@ -69,6 +69,6 @@ fn feature(kind: &str, geometry: &str, coordinates: &Value, properties: Value) -
     json!({
         "type": "Feature",
         "geometry": { "type": geometry, "coordinates": coordinates },
-        "properties": told,
+        "properties": members,
     })
 }

@@ -70,14 +70,14 @@ impl RegionApi {
     ///
     /// # Errors
     /// Returns the reason why its maps are not read.
-    pub(super) fn look(
+    pub(super) fn set_view(
         &self,
         viewer: &ViewerId,
         bounds: &GeographicBounds,
         now: Timestamp,
     ) -> Result<(), MapsWithheld> {
         self.viewers()
-            .look(viewer.clone(), bounds.tiles(MAX_TILES_OF_VIEW), now)?;
+            .set_view(viewer.clone(), bounds.tiles(MAX_TILES_OF_VIEW), now)?;
         self.ask(now).remove(viewer).map_or(Ok(()), Err)
     }
 
@@ -163,7 +163,7 @@ async fn show_view(
         .filter(|name| name.len() <= MAX_NAME_BYTES)
         .unwrap_or_default();
     let now = clock::now();
-    let looked = api.look(
+    let viewed = api.set_view(
         &ViewerId {
             host: host.0,
             name: name.to_owned(),
@@ -174,7 +174,7 @@ async fn show_view(
     let link = api.state.link();
     let read = api.state.tiles();
     let town = api.state.town().view(&bounds, &read, now);
-    let maps_withheld = looked.err().map(MapsWithheld::in_words);
+    let maps_withheld = viewed.err().map(MapsWithheld::in_words);
     Json(ViewAnswer {
         broker_up: link.is_up,
         trouble: link.trouble,

@@ -32,7 +32,7 @@ struct TownWindow {
     tiles: Vec<Quadkey>,
     /// Number of cells in the tiles, if counted since the last request.
     cells: Option<usize>,
-    looked_at: Timestamp,
+    viewed_at: Timestamp,
 }
 
 /// The reason why the maps of a view are not read.
@@ -84,7 +84,7 @@ impl Viewers {
     ///
     /// # Errors
     /// Returns [`MapsWithheld::ManyViews`]; the state is then unchanged.
-    pub(super) fn look(
+    pub(super) fn set_view(
         &mut self,
         viewer: ViewerId,
         tiles: Vec<Quadkey>,
@@ -101,7 +101,7 @@ impl Viewers {
             TownWindow {
                 tiles,
                 cells: None,
-                looked_at: now,
+                viewed_at: now,
             },
         );
         Ok(())
@@ -110,8 +110,8 @@ impl Viewers {
     /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with
     /// the most.
     fn replaced_by(&self, viewer: &ViewerId, now: Timestamp) -> Option<ViewerId> {
-        let oldest = self.views.iter().min_by_key(|(_, view)| view.looked_at)?;
-        if now.since(oldest.1.looked_at) >= IDLE_AFTER {
+        let oldest = self.views.iter().min_by_key(|(_, view)| view.viewed_at)?;
+        if now.since(oldest.1.viewed_at) >= IDLE_AFTER {
             return Some(oldest.0.clone());
         }
         let mut by_host = BTreeMap::<IpAddr, usize>::new();
@@ -125,7 +125,7 @@ impl Viewers {
             .iter()
             .filter(|(id, _)| id.host == host && most > own + 1);
         of_host
-            .min_by_key(|(_, view)| view.looked_at)
+            .min_by_key(|(_, view)| view.viewed_at)
             .map(|(id, _)| id.clone())
     }
 
@@ -137,7 +137,7 @@ impl Viewers {
         now: Timestamp,
     ) -> (BTreeSet<Quadkey>, BTreeMap<ViewerId, MapsWithheld>) {
         self.views
-            .retain(|_, view| now.since(view.looked_at) < VIEW_LASTS);
+            .retain(|_, view| now.since(view.viewed_at) < VIEW_LASTS);
         for view in self.views.values_mut() {
             view.cells.get_or_insert_with(|| count(&view.tiles));
         }
@@ -225,7 +225,7 @@ mod tests {
         let mut viewers = Viewers::new(vec![tile("0")]);
         let read = |viewers: &mut Viewers, ms| viewers.tiles(|_| 1, at(ms)).0;
         viewers
-            .look(
+            .set_view(
                 viewer(1, 1),
                 vec![tile("12"), tile("123"), tile("013")],
                 at(0),
@@ -233,7 +233,7 @@ mod tests {
             .unwrap();
         assert_eq!(read(&mut viewers, 1), [tile("0"), tile("12")].into());
         viewers
-            .look(viewer(1, 2), vec![tile("2")], at(5000))
+            .set_view(viewer(1, 2), vec![tile("2")], at(5000))
             .unwrap();
         assert_eq!(
             read(&mut viewers, 5000),
@@ -241,7 +241,7 @@ mod tests {
         );
         assert_eq!(read(&mut viewers, 11_000), [tile("0"), tile("2")].into());
         viewers
-            .look(viewer(1, 2), vec![tile("33")], at(12_000))
+            .set_view(viewer(1, 2), vec![tile("33")], at(12_000))
             .unwrap();
         assert_eq!(
             read(&mut viewers, 12_000),
@@ -255,11 +255,11 @@ mod tests {
     fn host_with_many_views_keeps_share() {
         let mut viewers = Viewers::new(Vec::new());
         for number in 0..200 {
-            let looked = viewers.look(viewer(1, number), vec![numbered(number)], at(1000));
-            assert_eq!(looked.is_ok(), number < MAX_VIEWS, "{number}");
+            let result = viewers.set_view(viewer(1, number), vec![numbered(number)], at(1000));
+            assert_eq!(result.is_ok(), number < MAX_VIEWS, "{number}");
         }
         for number in 0..40 {
-            let _ = viewers.look(
+            let _ = viewers.set_view(
                 viewer(2, number),
                 vec![numbered(200 + number % 50)],
                 at(1001),
@@ -274,7 +274,7 @@ mod tests {
         };
         assert_eq!([of(&viewers, 1), of(&viewers, 2)], [32, 32]);
         viewers
-            .look(viewer(3, 0), vec![tile("3333")], at(1002))
+            .set_view(viewer(3, 0), vec![tile("3333")], at(1002))
             .unwrap();
         assert!(viewers.tiles(|_| 1, at(1002)).0.contains(&tile("3333")));
         assert_eq!(viewers.views.len(), MAX_VIEWS);
@@ -283,14 +283,16 @@ mod tests {
     #[test]
     fn idle_view_is_evicted_first() {
         let mut viewers = Viewers::new(Vec::new());
-        viewers.look(viewer(2, 0), vec![tile("3")], at(0)).unwrap();
+        viewers
+            .set_view(viewer(2, 0), vec![tile("3")], at(0))
+            .unwrap();
         for number in 1..MAX_VIEWS {
             viewers
-                .look(viewer(1, number), vec![numbered(number)], at(3000))
+                .set_view(viewer(1, number), vec![numbered(number)], at(3000))
                 .unwrap();
         }
         viewers
-            .look(viewer(1, 100), vec![tile("2")], at(3000))
+            .set_view(viewer(1, 100), vec![tile("2")], at(3000))
             .unwrap();
         assert!(
             !viewers.views.contains_key(&viewer(2, 0)) && viewers.views.contains_key(&viewer(1, 1))
@@ -304,13 +306,13 @@ mod tests {
         let count = |tiles: &[Quadkey]| 100 * tiles.len();
         for number in 0..12 {
             let tiles = (0..20).map(|tile| numbered(20 * number + tile)).collect();
-            viewers.look(viewer(1, number), tiles, at(0)).unwrap();
+            viewers.set_view(viewer(1, number), tiles, at(0)).unwrap();
         }
         viewers
-            .look(viewer(2, 0), (240..256).map(numbered).collect(), at(0))
+            .set_view(viewer(2, 0), (240..256).map(numbered).collect(), at(0))
             .unwrap();
         viewers
-            .look(viewer(3, 0), (0..21).map(numbered).collect(), at(0))
+            .set_view(viewer(3, 0), (0..21).map(numbered).collect(), at(0))
             .unwrap();
         let (read, withheld) = viewers.tiles(count, at(0));
         assert!(

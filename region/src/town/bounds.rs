@@ -76,7 +76,7 @@ impl GeographicBounds {
     }
 
     /// True if both have a place in common.
-    pub fn meets(&self, other: &Self) -> bool {
+    pub fn intersects(&self, other: &Self) -> bool {
         self.west < other.east
             && other.west < self.east
             && self.south < other.north
@@ -87,10 +87,12 @@ impl GeographicBounds {
     /// cell's tile.
     pub fn tiles(&self, max: usize) -> Vec<Quadkey> {
         let mut tiles = vec![Quadkey::default()];
-        tiles.retain(|tile| self.meets(&Self::of(*tile)));
+        tiles.retain(|tile| self.intersects(&Self::of(*tile)));
         for _ in 0..CELL_TILE_DIGITS {
             let parts = tiles.iter().flat_map(|tile| tile.quarters());
-            let smaller: Vec<_> = parts.filter(|part| self.meets(&Self::of(*part))).collect();
+            let smaller: Vec<_> = parts
+                .filter(|part| self.intersects(&Self::of(*part)))
+                .collect();
             if smaller.is_empty() || smaller.len() > max {
                 break;
             }

@@ -183,7 +183,7 @@ impl RegionTown {
             let state = cell.state(now, read_since);
             region.add(cell, state);
             known = Some(known.map_or(at, |known| known.with(at)));
-            if at.meets(bounds) {
+            if at.intersects(bounds) {
                 has_maps &= read_since.is_some();
                 shown.push((*tile, name, cell, state));
             }
@@ -255,7 +255,7 @@ impl TownTotals {
         self.cells += 1;
         let number = match state {
             CellState::Live => &mut self.live,
-            CellState::Told => &mut self.told,
+            CellState::Claimed => &mut self.told,
             CellState::Silent => &mut self.silent,
             CellState::Offline => &mut self.offline,
         };

@@ -194,10 +194,10 @@ fn silence_starts_at_due_map() {
         let cell = &town.cells()[&(tile(), NodeName::from_static("lot"))];
         cell.state(at(ms), read_ms.map(at))
     };
-    assert_eq!(state(&town, None, 60_000), CellState::Told);
+    assert_eq!(state(&town, None, 60_000), CellState::Claimed);
     for (ms, expected) in [
-        (60_000, CellState::Told),
-        (62_900, CellState::Told),
+        (60_000, CellState::Claimed),
+        (62_900, CellState::Claimed),
         (63_000, CellState::Silent),
     ] {
         assert_eq!(state(&town, Some(60_000), ms), expected, "{ms} ms");
@@ -206,7 +206,7 @@ fn silence_starts_at_due_map() {
     status(&mut town, "lot", 70_000, NodeState::Offline).unwrap();
     assert_eq!(state(&town, Some(60_000), 71_000), CellState::Offline);
     status(&mut town, "lot", 72_000, NodeState::Aggregating).unwrap();
-    assert_eq!(state(&town, Some(60_000), 73_000), CellState::Told);
+    assert_eq!(state(&town, Some(60_000), 73_000), CellState::Claimed);
     status(&mut town, "lot", 74_500, NodeState::Aggregating).unwrap();
     assert_eq!(state(&town, Some(60_000), 75_000), CellState::Silent);
     // The time is long enough for a cell at 2 Hz.
@@ -216,7 +216,7 @@ fn silence_starts_at_due_map() {
         assert_eq!(
             state,
             if round < 3 {
-                CellState::Told
+                CellState::Claimed
             } else {
                 CellState::Live
             },

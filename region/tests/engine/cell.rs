@@ -24,13 +24,13 @@ pub(crate) struct Cell {
     pub(crate) account: CellAccount,
     origin: GeographicOrigin,
     pub(crate) client: AsyncClient,
-    heard: Arc<Mutex<Heard>>,
+    received: Arc<Mutex<Received>>,
     polling: JoinHandle<()>,
 }
 
 /// Answers and messages of the broker.
 #[derive(Debug, Default, Clone)]
-pub(crate) struct Heard {
+pub(crate) struct Received {
     pub(crate) logins: usize,
     pub(crate) is_refused: bool,
     pub(crate) granted: Vec<bool>,
@@ -50,8 +50,8 @@ impl Cell {
             rotation_deg: 0.0,
         };
         let (client, mut events) = AsyncClient::new(broker.login(name).options(), 4096);
-        let heard = Arc::new(Mutex::new(Heard::default()));
-        let noted = Arc::clone(&heard);
+        let received = Arc::new(Mutex::new(Received::default()));
+        let noted = Arc::clone(&received);
         let polling = tokio::spawn(async move {
             loop {
                 let event = events.poll().await;
@@ -84,7 +84,7 @@ impl Cell {
             account: CellAccount::new(NodeName::from_static(name), &origin),
             origin,
             client,
-            heard,
+            received,
             polling,
         }
     }
@@ -101,8 +101,8 @@ impl Cell {
         }
     }
 
-    pub(crate) fn heard(&self) -> Heard {
-        self.heard.lock().unwrap().clone()
+    pub(crate) fn received(&self) -> Received {
+        self.received.lock().unwrap().clone()
     }
 
     /// A topic of this cell.
@@ -184,16 +184,16 @@ impl Cell {
 
     /// Subscribes, and returns what the broker granted.
     pub(crate) async fn subscribe(&self, filters: &[String]) -> Vec<bool> {
-        let before = self.heard().granted.len();
+        let before = self.received().granted.len();
         let wanted = filters
             .iter()
             .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce));
         self.client.subscribe_many(wanted).await.unwrap();
         crate::broker::until("the broker answers", || {
-            self.heard().granted.len() == before + filters.len()
+            self.received().granted.len() == before + filters.len()
         })
         .await;
-        self.heard().granted.split_off(before)
+        self.received().granted.split_off(before)
     }
 }
 

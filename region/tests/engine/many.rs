@@ -253,7 +253,8 @@ async fn ten_thousand_cells_are_shown() {
     );
 
     // A fifth of the town, whose maps are read; then a view small enough for single cells.
-    let [west, south] = [1.99, 48.49];
+    let west = 1.99;
+    let south = 48.49;
     for (name, side) in [("part", READ_SIDE), ("quarter", 20)] {
         let query = format!(
             "viewer=a&bounds={west},{south},{},{}",

@@ -59,7 +59,7 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     })
     .await;
     assert_eq!(
-        lot.heard().logins,
+        lot.received().logins,
         1,
         "a refused message ends no connection"
     );
@@ -140,8 +140,8 @@ async fn mosquitto_rights_end_at_tile() {
     lot.subscribe(&["ecod/v1/#".to_owned()]).await;
     far.publish_map(2, 1);
     lot.publish_map(3, 1);
-    until("the own map is heard", || !lot.heard().topics.is_empty()).await;
-    assert_eq!(lot.heard().topics, [own]);
+    until("the own map is heard", || !lot.received().topics.is_empty()).await;
+    assert_eq!(lot.received().topics, [own]);
 }
 
 /// A cell that is added while the server runs.
@@ -151,10 +151,10 @@ const NEW: (&str, f64, f64) = ("new-1", 48.86, 2.30);
 async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
     let mut cell = Cell::connect(broker, place);
     until("the cell is in", || {
-        if cell.heard().is_refused {
+        if cell.received().is_refused {
             cell = Cell::connect(broker, place);
         }
-        cell.heard().logins == 1
+        cell.received().logins == 1
     })
     .await;
     cell
@@ -164,7 +164,7 @@ async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
 async fn adding_cell_disconnects_no_others() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
-    until("the cell is in", || lot.heard().logins == 1).await;
+    until("the cell is in", || lot.received().logins == 1).await;
     broker.add_cell(NEW.0, NEW.1, NEW.2);
     let added = admitted(&broker, NEW).await;
     added.publish(
@@ -174,16 +174,16 @@ async fn adding_cell_disconnects_no_others() {
     );
     let state = broker.read(|_| ());
     until("its status is read", || state.town().cells().len() == 1).await;
-    assert_eq!(lot.heard().logins, 1);
+    assert_eq!(lot.received().logins, 1);
 
     // It goes on with the password that it has.
     broker.renew_password(NEW.0, NEW.1, NEW.2);
     until("who has the former password is shut out", || {
-        added.heard().is_refused
+        added.received().is_refused
     })
     .await;
     admitted(&broker, NEW).await;
-    assert_eq!(lot.heard().logins, 1);
+    assert_eq!(lot.received().logins, 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]

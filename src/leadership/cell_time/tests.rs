@@ -117,12 +117,12 @@ impl Cell {
             .follow(&leadership, now.shifted(receiver.steady_us));
     }
 
-    fn look(&mut self) {
+    fn read_wall(&mut self) {
         for index in 0..self.nodes.len() {
             let leadership = self.leadership(index);
             let now = self.now;
             let node = &mut self.nodes[index];
-            let events = node.time.look(
+            let events = node.time.read_wall(
                 node.wall_us - node.steady_us,
                 &leadership,
                 now.shifted(node.steady_us),
@@ -139,7 +139,7 @@ impl Cell {
                 self.pass(index, leader);
                 self.pass(leader, index);
             }
-            self.look();
+            self.read_wall();
             self.now = self.now + Duration::from_secs(1);
         }
     }
@@ -404,7 +404,7 @@ fn false_stamps_move_no_time() {
                 };
                 let now = cell.now;
                 cell.nodes[0].time.receive(&message, Rights::ALL, now);
-                cell.look();
+                cell.read_wall();
             }
         }
     }
@@ -423,7 +423,7 @@ fn expelled_leader_sets_no_time() {
     cell.leader = 1;
     let leadership = cell.leadership(1);
     let successor = &mut cell.nodes[1];
-    successor.time.forget(&gone);
-    let events = successor.time.look(0, &leadership, now);
+    successor.time.remove(&gone);
+    let events = successor.time.read_wall(0, &leadership, now);
     assert_eq!(cell.errors()[1], 0, "{events:?}");
 }

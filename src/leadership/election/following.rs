@@ -67,7 +67,7 @@ impl Election {
     /// Processes a leader's beat or claim.
     ///
     /// A beat of the followed epoch refreshes the leader. A seeking node follows the sender unless
-    /// it has followed a later epoch. A leader decides in `meet_leader` which of the two continues.
+    /// it has followed a later epoch. A leader decides in `on_other_leader` which of the two continues.
     /// A follower that receives another node's claim follows it only if that node is better by rank
     /// or number of followers; otherwise it keeps the claim and sends its status. A beat of a lower
     /// epoch is answered by a status, so that its sender renews its term.
@@ -84,7 +84,7 @@ impl Election {
         }
         match &mut self.state {
             State::Following(following) if following.epoch == beat.epoch => self.refresh(beat, now),
-            State::Leading(_) => self.meet_leader(beat, now),
+            State::Leading(_) => self.on_other_leader(beat, now),
             State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
             State::Following(following) if beat.epoch > following.epoch => {
                 let leader = following.epoch.leader.clone();
@@ -131,7 +131,7 @@ impl Election {
     /// term 6 (`contest`). `gauss` answers beats of term 4 by its own beat. When `edge` leads in
     /// term 6, `gauss` has fewer followers: it stops publishing, sends `edge` its evidence and
     /// follows.
-    fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
+    fn on_other_leader(&mut self, beat: Beat, now: Timestamp) {
         let State::Leading(leading) = &self.state else {
             return;
         };
@@ -240,7 +240,7 @@ impl Election {
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.receive(now);
         following.has_beaten = true;
-        following.forget_round_interval(now);
+        following.drop_round_interval(now);
         if beat.hears_us {
             following.bidirectional_at = now;
         }
@@ -258,7 +258,7 @@ impl Election {
     /// `euclid` follows `edge` in term 4. `edge` has handed over to `gauss`, and its status states
     /// term 5 of `gauss`. `euclid` closes term 4 and follows `gauss`, before the first beat of
     /// `gauss` has arrived.
-    pub(super) fn on_foreign_message(&mut self, message: &ElectionMessage, now: Timestamp) {
+    pub(super) fn on_other_leadership(&mut self, message: &ElectionMessage, now: Timestamp) {
         match &self.state {
             State::Following(following) if following.epoch.leader == message.from => {
                 let leads = message.epoch.as_ref() == Some(&following.epoch);
@@ -337,7 +337,7 @@ impl Election {
         // followers that do not receive the other leader's next beat for a while.
         let current = self.current_epoch().cloned();
         let is_corrected = self.peers.correct(from, &self.id, current.as_ref());
-        if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.told) {
+        if !is_corrected && self.peers.get(from).is_none_or(|peer| peer.is_confirmed) {
             return;
         }
         if self.is_leading() {

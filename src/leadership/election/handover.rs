@@ -72,7 +72,7 @@ impl Election {
         };
         if !fit || now.since(handover.started_at) > limit {
             leading.handover = None;
-            self.peers.restart_trial(&to, now);
+            self.peers.restart_stability(&to, now);
             return;
         }
         if now < handover.retry_at {

@@ -126,7 +126,7 @@ impl Following {
     }
 
     /// Removes the round interval when rounds have stopped arriving.
-    pub(super) fn forget_round_interval(&mut self, now: Timestamp) {
+    pub(super) fn drop_round_interval(&mut self, now: Timestamp) {
         self.round_interval.take_if(|gap| {
             self.round_at
                 .is_none_or(|last| now.since(last) > *gap * REGULAR_GAPS)

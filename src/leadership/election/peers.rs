@@ -32,7 +32,7 @@ pub(super) struct Peer {
     /// Epoch that the peer follows or leads, according to its last message.
     pub(super) epoch: Option<Epoch>,
     /// True if the last message to the peer confirmed that this node receives it.
-    pub(super) told: bool,
+    pub(super) is_confirmed: bool,
     /// True while the peer refuses this node's leadership.
     refuses: bool,
     /// Candidates at whose brokers the peer reports that it cannot log in.
@@ -67,7 +67,7 @@ pub(super) struct Peers {
     given_up_timeout: Duration,
     standby_silence: Duration,
     /// Time of the next check for peers that were given up and have been silent since.
-    forget_at: Option<Timestamp>,
+    drop_at: Option<Timestamp>,
 }
 
 impl Peers {
@@ -80,7 +80,7 @@ impl Peers {
             response_timeout: config.response_timeout(),
             given_up_timeout: config.given_up_timeout(),
             standby_silence: config.standby_silence(),
-            forget_at: None,
+            drop_at: None,
         }
     }
 
@@ -116,14 +116,14 @@ impl Peers {
     }
 
     /// Records that a message is sent to a peer. Returns the `hears_you` flag for that message.
-    pub(super) fn tell(&mut self, name: &NodeName, now: Timestamp) -> bool {
+    pub(super) fn record_sent(&mut self, name: &NodeName, now: Timestamp) -> bool {
         let Some(peer) = self.table.get_mut(name) else {
             return false;
         };
-        peer.told = peer
+        peer.is_confirmed = peer
             .heard_at
             .is_some_and(|at| now.since(at) <= self.contact_timeout);
-        peer.told
+        peer.is_confirmed
     }
 
     /// True if a peer follows a leadership of `leader` that is over and has not been notified of
@@ -242,7 +242,7 @@ impl Peers {
         }
         // A new run, or a peer that was out of contact, has to be informed again that this node
         // receives it.
-        peer.told &= !silent && message.run == peer.run;
+        peer.is_confirmed &= !silent && message.run == peer.run;
         peer.run = message.run;
         peer.seq = message.seq;
         peer.heard_at = Some(now);
@@ -274,19 +274,19 @@ impl Peers {
             self.table.remove(name);
         } else {
             peer.given_up_at = Some(now);
-            self.forget_at.get_or_insert(now + self.given_up_timeout);
+            self.drop_at.get_or_insert(now + self.given_up_timeout);
         }
     }
 
     /// Removes the peers that were given up and have been silent since.
-    pub(super) fn forget_silent(&mut self, now: Timestamp) {
-        if self.forget_at.is_none_or(|at| now < at) {
+    pub(super) fn drop_silent(&mut self, now: Timestamp) {
+        if self.drop_at.is_none_or(|at| now < at) {
             return;
         }
         let wait = self.given_up_timeout;
         self.table
             .retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
-        self.forget_at = self
+        self.drop_at = self
             .table
             .values()
             .filter_map(|peer| peer.given_up_at)
@@ -301,7 +301,7 @@ impl Peers {
     }
 
     /// Restarts the time for which a peer must be stable before leadership is handed to it.
-    pub(super) fn restart_trial(&mut self, name: &NodeName, now: Timestamp) {
+    pub(super) fn restart_stability(&mut self, name: &NodeName, now: Timestamp) {
         if let Some(peer) = self.table.get_mut(name) {
             peer.fit_since = peer.fit_since.map(|_| now);
         }

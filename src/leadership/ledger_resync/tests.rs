@@ -1,6 +1,6 @@
 //! Evidence of other nodes: which evidence is accepted, what it costs, and how it outlives leaders.
 
-mod trial;
+mod probation;
 
 use super::growth::MAX_FIRST_VOTES;
 use super::*;
@@ -540,7 +540,7 @@ fn invented_lane_has_no_effect() {
         3,
         "a leader is believed while it leads"
     );
-    let over = EVIDENCE_TRIAL.as_millis() as u64;
+    let over = EVIDENCE_PROBATION.as_millis() as u64;
     euclid.wait_until(over);
     euclid.leadership = following(9, "edge");
     let late = sign(vec![share("gauss", None, vec![slander(8, "gauss", 4)])]);
@@ -568,7 +568,7 @@ fn dead_leaders_signature_is_relayed() {
     }
     assert_eq!(said.len(), 3, "one signature for each round");
     euclid.receive(&said);
-    euclid.wait_until(EVIDENCE_TRIAL.as_millis() as u64);
+    euclid.wait_until(EVIDENCE_PROBATION.as_millis() as u64);
     let news = share("leader", Some(8), Vec::new());
     euclid.leadership = following(8, "leader");
     edge.leadership = following(8, "leader");

@@ -97,7 +97,7 @@ pub enum Input {
         state: LinkState,
     },
     /// A broker forwarded a node's status or its last will.
-    StatusHeard {
+    StatusReceived {
         /// The status; its state is `offline` in a last will.
         status: NodeStatus,
     },
@@ -114,8 +114,8 @@ pub enum Input {
         /// Name of the candidate that shared the evidence.
         from: NodeName,
     },
-    /// The answer to [`Effect::Look`], at once.
-    Looked {
+    /// The answer to [`Effect::Observe`], at once.
+    Observed {
         /// Number of times so far that the fuser found its round due: its timer runs.
         rounds_due: u64,
         /// Processor load of the machine, 0 to 100 %.
@@ -142,7 +142,7 @@ pub enum Input {
         keeps_reputations: bool,
     },
     /// Parts of the node's published status. This input may come with every check.
-    Telling {
+    StatusParts {
         /// All current troubles of the node.
         troubles: Vec<Trouble>,
         /// Address and port of its page.
@@ -214,8 +214,8 @@ pub enum Effect {
         /// Name of the node.
         to: NodeName,
     },
-    /// Check the node's own parts and pass [`Input::Looked`] at once.
-    Look,
+    /// Check the node's own parts and pass [`Input::Observed`] at once.
+    Observe,
     /// Query broker, gateway and fuser, and pass [`Input::PartsAnswered`] when they have answered.
     AskParts,
     /// Count a message of this node that states an implausibly high term or round.

@@ -35,7 +35,7 @@ impl Members {
     }
 
     /// True if this run of a member is already stored.
-    pub(super) fn knows(&self, member: &SeenMember) -> bool {
+    pub(super) fn contains(&self, member: &SeenMember) -> bool {
         self.living
             .get(&member.name)
             .is_some_and(|known| known.run == member.run)

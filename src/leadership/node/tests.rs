@@ -94,7 +94,7 @@ impl Scene {
     fn handle_input(&mut self, input: Input) {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
-                Effect::Look => Input::Looked {
+                Effect::Observe => Input::Observed {
                     rounds_due: self.rounds_due,
                     load_percent: 0,
                     members: self.members.clone(),
@@ -275,10 +275,10 @@ fn last_will_ends_leader() {
         state,
         ..status(Role::Edge)
     };
-    scene.handle_input(Input::StatusHeard {
+    scene.handle_input(Input::StatusReceived {
         status: status(living, NodeState::Aggregating),
     });
-    scene.handle_input(Input::StatusHeard {
+    scene.handle_input(Input::StatusReceived {
         status: status(earlier, NodeState::Offline),
     });
     assert_eq!(
@@ -286,10 +286,10 @@ fn last_will_ends_leader() {
         Some(&name("edge")),
         "the will of a run before this one"
     );
-    scene.handle_input(Input::StatusHeard {
+    scene.handle_input(Input::StatusReceived {
         status: status(living, NodeState::Aggregating),
     });
-    scene.handle_input(Input::StatusHeard {
+    scene.handle_input(Input::StatusReceived {
         status: status(living, NodeState::Offline),
     });
     assert!(
@@ -334,7 +334,7 @@ fn false_will_ends_run_once() {
         for state in [NodeState::Aggregating, NodeState::Offline] {
             let node = name("edge");
             let id = Uuid::from_u128(attempt.into());
-            scene.handle_input(Input::StatusHeard {
+            scene.handle_input(Input::StatusReceived {
                 status: NodeStatus {
                     node,
                     id,

@@ -97,7 +97,9 @@ impl VehicleBelief {
             .filter_map(|(place, belief)| Some((place_now(place)?, belief)))
             .collect();
         kept.sort_by_key(|(place, _)| *place);
-        (self.places, self.beliefs) = kept.into_iter().unzip();
+        let (places, beliefs) = kept.into_iter().unzip();
+        self.places = places;
+        self.beliefs = beliefs;
         self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
     }
 
@@ -159,12 +161,14 @@ impl VehicleBelief {
             .chain(added.into_iter().map(|place| (place, Belief::default())))
             .collect();
         all.sort_by_key(|(place, _)| *place);
-        (self.places, self.beliefs) = all.into_iter().unzip();
+        let (places, beliefs) = all.into_iter().unzip();
+        self.places = places;
+        self.beliefs = beliefs;
     }
 
     /// Drops beliefs that were last observed before `limit`; returns the time of the oldest one
     /// left, if any is.
-    pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
+    pub(super) fn drop_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
         if self.oldest_seen.is_some_and(|oldest| oldest < limit) {
             let mut beliefs = self.beliefs.iter();
             self.places.retain(|_| {

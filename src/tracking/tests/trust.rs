@@ -67,9 +67,9 @@ fn observers_precede_vehicles_that_miss() {
     let mut history = DetectionHistory::default();
     let with_slot = ids[..100]
         .iter()
-        .filter(|id| history.for_look(**id, at(0)).is_some())
+        .filter(|id| history.for_observation(**id, at(0)).is_some())
         .count();
-    assert!(with_slot < 100 && history.for_look(ids[100], at(1)).is_none());
+    assert!(with_slot < 100 && history.for_observation(ids[100], at(1)).is_none());
     assert!(history.for_hit(ids[100], at(1)).is_some());
     assert!(history.has_room(ids[100], at(1)) && !history.has_room(ids[0], at(1)));
 }
@@ -139,7 +139,7 @@ fn distrust_survives_silence() {
 }
 
 #[test]
-fn least_evidence_is_forgotten_first() {
+fn least_evidence_is_dropped_first() {
     let mut dormant = DormantCounts::default();
     let config = ReputationConfig::default();
     dormant.keep([

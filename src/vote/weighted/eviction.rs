@@ -21,10 +21,10 @@ impl WeightedVoting {
         for landmark in self.landmarks_where(|l| l.votes.iter().any(is_theirs)) {
             self.remove_votes(landmark, is_theirs);
         }
-        self.dependence.forget(&gone);
-        self.calibration.forget(&gone);
-        self.model.label_bias.forget(&gone);
-        self.labels.forget_vehicles(&gone);
+        self.dependence.remove_vehicles(&gone);
+        self.calibration.remove_vehicles(&gone);
+        self.model.label_bias.remove_vehicles(&gone);
+        self.labels.remove_vehicles(&gone);
         for &vehicle in &gone {
             self.counts[vehicle] = Counts::default();
             self.model.vehicles[vehicle] = VehicleEvidence::default();
@@ -63,18 +63,18 @@ impl WeightedVoting {
             l.votes.iter().any(|vote| is_gone(vote.label))
                 || l.posterior.iter().any(|(label, _)| is_gone(*label))
         };
-        let mut forgotten = 0;
+        let mut dropped = 0;
         for landmark in self.landmarks_where(is_affected) {
             // Without settling: the other votes would become evidence more often than by their age.
             self.remove_live(landmark);
-            forgotten += self.landmarks.votes_mut(landmark).forget_labels(is_gone);
+            dropped += self.landmarks.votes_mut(landmark).remove_labels(is_gone);
             self.changed.insert(landmark);
         }
         for vote in self.landmarks.iter_mut().flat_map(|l| &mut l.votes) {
-            vote.recent.forget_labels(is_gone);
+            vote.recent.remove_labels(is_gone);
         }
-        self.model.forget_labels(&gone);
-        self.dependence.forget_labels(&gone);
-        forgotten
+        self.model.remove_labels(&gone);
+        self.dependence.remove_labels(&gone);
+        dropped
     }
 }

@@ -158,7 +158,9 @@ fn right(items: &[Item], verdicts: impl Iterator<Item = Verdict>) -> Vec<f64> {
 fn score(number: u64, items: usize) -> Score {
     let kind = sets::kind(number);
     let mut majority = Difference::default();
-    let [mut online, mut passes, mut passes_beside_online] = [Difference::default(); 3];
+    let mut online = Difference::default();
+    let mut passes = Difference::default();
+    let mut passes_beside_online = Difference::default();
     let mut draw = 0;
     while majority.items < items as f64 {
         let set = kind.generate(1000 * number + draw, items);

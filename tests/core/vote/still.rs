@@ -34,10 +34,15 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
     for round in 0..ROUNDS {
         now = now + PERIOD;
         for vehicle in 0..cell.vehicles {
-            let mut see = |truth: usize| match (vehicle < cell.liars, rng.random_bool(0.8)) {
-                (true, _) => (truth + 1) % LABELS.len(),
-                (false, true) => truth,
-                (false, false) => (truth + rng.random_range(1..LABELS.len())) % LABELS.len(),
+            let mut see = |truth: usize| {
+                let is_right = rng.random_bool(0.8);
+                if vehicle < cell.liars {
+                    (truth + 1) % LABELS.len()
+                } else if is_right {
+                    truth
+                } else {
+                    (truth + rng.random_range(1..LABELS.len())) % LABELS.len()
+                }
             };
             let objects = truths
                 .iter()

@@ -283,13 +283,13 @@ impl World {
             fail("a later leadership's was accepted before the start");
         }
         if let Some(elected) = node.leadership.present_epoch() {
-            let is_heard = |accepted: &Accepted| {
+            let is_received = |accepted: &Accepted| {
                 accepted.epoch == *elected
                     && u128::from(self.now - accepted.at) < ELECTED_SILENCE.as_micros()
             };
             let may_lead = [Some(&elected.leader), node.leadership.standby.as_ref()]
                 .contains(&Some(&map.epoch.leader));
-            if map.epoch > *elected && !may_lead && of_this_run().next().is_some_and(is_heard) {
+            if map.epoch > *elected && !may_lead && of_this_run().next().is_some_and(is_received) {
                 fail("the elected leader's are there, and it is no successor of it");
             }
         }

@@ -159,7 +159,7 @@ impl World {
             let is_of_leader = |now: &Epoch| now.leader == lane.leader && lane <= *now;
             let is_told_by_another = share.node != lane.leader
                 && node.leadership.present_epoch().is_some_and(is_of_leader);
-            node.leadership.knows_term(term) && !is_told_by_another
+            node.leadership.has_term(term) && !is_told_by_another
         };
         let entries = share
             .entries
@@ -193,7 +193,7 @@ impl World {
             node.name
         );
         node.saved.clone_from(&node.ledger);
-        node.saved.end_trials(now, |_| true);
+        node.saved.end_probations(now, |_| true);
         let shares = node
             .resync
             .tick(&mut node.ledger, &node.leadership, now)

@@ -87,7 +87,7 @@ pub(crate) enum Arrival {
         share: Box<LedgerShare>,
     },
     /// News of the membership.
-    Tell {
+    Membership {
         about: usize,
         about_life: u64,
         is_there: bool,
@@ -253,7 +253,9 @@ impl Node {
         self.ledger = self.saved.clone();
         self.resync
             .resume(&self.ledger, Timestamp(now).shifted(self.clock));
-        (self.known, self.members, self.links) = Default::default();
+        self.known.clear();
+        self.members.clear();
+        self.links.clear();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted, Timestamp(now).shifted(self.clock));
         let status = NodeStatus::starting(

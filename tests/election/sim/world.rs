@@ -222,12 +222,12 @@ impl World {
             Arrival::Map { map } => self.accept(to, &map),
             Arrival::Share { share } => self.take_share(to, &share),
             // A membership reports its events in order.
-            Arrival::Tell {
+            Arrival::Membership {
                 about,
                 about_life,
                 is_there,
             } if self.nodes[to].known.get(&about) != is_there.then_some(&about_life) => {}
-            Arrival::Tell {
+            Arrival::Membership {
                 about,
                 about_life,
                 is_there: true,
@@ -240,7 +240,7 @@ impl World {
                     },
                 );
             }
-            Arrival::Tell { about, .. } => {
+            Arrival::Membership { about, .. } => {
                 self.nodes[to].members.remove(&about);
                 self.handle(
                     to,
@@ -384,7 +384,7 @@ impl World {
                 self.push_to(
                     to,
                     after,
-                    Arrival::Tell {
+                    Arrival::Membership {
                         about,
                         about_life,
                         is_there,
@@ -483,7 +483,7 @@ impl World {
             }
             Effect::SendSnapshot { .. } => self.share_all(index),
             Effect::SetLinks { links } => self.set_links(index, &links),
-            Effect::Look => {
+            Effect::Observe => {
                 let node = &self.nodes[index];
                 let members = node
                     .members
@@ -491,7 +491,7 @@ impl World {
                     .map(|(about, run)| self.member(*about, *run))
                     .collect();
                 let rounds_due = node.rounds_due(self.now);
-                return Some(Input::Looked {
+                return Some(Input::Observed {
                     rounds_due,
                     load_percent: LOAD,
                     members,

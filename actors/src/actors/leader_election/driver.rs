@@ -138,8 +138,8 @@ impl ElectionDriver {
             },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Expelled { name } => {
-                self.cell_time.forget(&name);
-                self.life_signs.forget(&name);
+                self.cell_time.remove(&name);
+                self.life_signs.remove(&name);
                 self.parts.fuser.send(FuserMessage::Expel { node: name });
                 return;
             }
@@ -209,7 +209,7 @@ impl ElectionDriver {
             let complaint = status.troubles.iter().find(of_this).cloned();
             self.complaint = complaint.map(|trouble| (status.node.clone(), trouble));
         }
-        self.handle(Input::StatusHeard {
+        self.handle(Input::StatusReceived {
             status: status.clone(),
         })
         .await;
@@ -219,8 +219,8 @@ impl ElectionDriver {
     ///
     /// # Example
     /// The timer fires: the input is [`Input::Wake`]. The leadership returns a beat for `gauss`,
-    /// which goes to the membership, and [`Effect::Look`], whose answers are the inputs
-    /// [`Input::Looked`] and [`Input::Telling`]. Both are processed, and the timer is set for the
+    /// which goes to the membership, and [`Effect::Observe`], whose answers are the inputs
+    /// [`Input::Observed`] and [`Input::StatusParts`]. Both are processed, and the timer is set for the
     /// next deadline.
     pub(super) async fn handle(&mut self, input: Input) {
         if input == Input::Wake {
@@ -262,7 +262,7 @@ impl ElectionDriver {
                     .membership
                     .send(MembershipMessage::Send { to, payload });
             }
-            Effect::PublishLeadership { leadership } => self.tell(leadership),
+            Effect::PublishLeadership { leadership } => self.publish_leadership(leadership),
             Effect::Lead {
                 epoch,
                 first_round,
@@ -308,8 +308,8 @@ impl ElectionDriver {
                     .keeper
                     .send(ReputationKeeperMessage::SendSnapshot { to });
             }
-            Effect::Look => {
-                let events = self.cell_time.look(
+            Effect::Observe => {
+                let events = self.cell_time.read_wall(
                     clock::wall_offset_us(),
                     &self.leadership.borrow(),
                     clock::now(),
@@ -323,7 +323,7 @@ impl ElectionDriver {
                     dismissed.truncate(MAX_DISMISSED - 1);
                     dismissed.push(self.name.clone());
                 }
-                let looked = Input::Looked {
+                let observed = Input::Observed {
                     rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
                     members: self.members.borrow().iter().map(as_seen).collect(),
@@ -331,8 +331,8 @@ impl ElectionDriver {
                 let page = self.page.borrow().map(|page| page.to_string());
                 let troubles = self.counters.troubles().present();
                 return vec![
-                    looked,
-                    Input::Telling {
+                    observed,
+                    Input::StatusParts {
                         troubles,
                         page,
                         dismissed,
@@ -426,7 +426,7 @@ impl ElectionDriver {
     }
 
     /// Publishes the leadership; a change of only the highest term does not notify readers.
-    fn tell(&self, leadership: Leadership) {
+    fn publish_leadership(&self, leadership: Leadership) {
         let Leadership {
             position,
             epoch,
@@ -459,7 +459,7 @@ impl ElectionDriver {
             return;
         }
         self.alarm = due;
-        let wake = || LeaderElectionMessage::Note { input: Input::Wake };
+        let wake = || LeaderElectionMessage::Record { input: Input::Wake };
         let timer = self.myself.send_after(due.since(clock::now()), wake);
         if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
             superseded.abort();

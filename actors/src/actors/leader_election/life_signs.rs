@@ -57,7 +57,7 @@ impl LifeSigns {
     }
 
     /// Removes the certificate of a node that was expelled.
-    pub(super) fn forget(&mut self, name: &NodeName) {
+    pub(super) fn remove(&mut self, name: &NodeName) {
         self.certificates.remove(name);
     }
 

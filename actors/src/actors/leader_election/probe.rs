@@ -58,7 +58,7 @@ pub(super) fn ask_parts(
         };
         let input = Input::PartsAnswered { sample };
         if election
-            .cast(LeaderElectionMessage::Note { input })
+            .cast(LeaderElectionMessage::Record { input })
             .is_err()
         {
             tracing::debug!("the election ended before its parts answered");

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ecod::leadership::Position;
 use ecod::leadership::cell_time::ClockReading;
-use ecod::leadership::timers::EVIDENCE_TRIAL;
+use ecod::leadership::timers::EVIDENCE_PROBATION;
 use ecod::model::time::Timestamp;
 use ecod::wire::LedgerEntry;
 use tempfile::TempDir;
@@ -262,7 +262,7 @@ async fn revoked_signer_loses_saved_evidence() {
     assert_eq!(votes(&early), (1, 0), "its leader is on trial");
     keeper.merge(&Delivery::local(
         Arc::clone(&said.message),
-        said.received_at + EVIDENCE_TRIAL,
+        said.received_at + EVIDENCE_PROBATION,
     ));
     keeper.save().await;
 
@@ -679,7 +679,7 @@ async fn election_receives_only_verified_evidence() {
     keeper.merge(&over("edge", share("edge", Some(7), Vec::new())));
     election.get().unwrap().drain_and_wait(None).await.unwrap();
     let mut senders = Vec::new();
-    while let Ok(LeaderElectionMessage::Note {
+    while let Ok(LeaderElectionMessage::Record {
         input: Input::EvidenceReceived { from },
     }) = told.try_recv()
     {

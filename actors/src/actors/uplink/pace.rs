@@ -47,10 +47,10 @@ impl MapPace {
 
     /// Advances to the next due time.
     pub(super) fn advance(&mut self, now: Timestamp) {
-        let is_heard = self
+        let has_neighbour = self
             .neighbour_at
             .is_some_and(|at| now.since(at) < NEIGHBOUR_TIMEOUT);
-        let factor = if is_heard { NEIGHBOUR_FACTOR } else { 1.0 };
+        let factor = if has_neighbour { NEIGHBOUR_FACTOR } else { 1.0 };
         let interval = Duration::from_secs_f64(1.0 / (factor * self.max_hz));
         self.max_early = interval.mul_f64(MAX_EARLY_SHARE);
         self.due = if now.since(self.due) < interval {

@@ -154,7 +154,7 @@ fn solve(
     let undistorted = Mat::default();
     let mut rotation = Mat::default();
     let mut translation = Mat::default();
-    let mut inliers = Vector::<i32>::new();
+    let mut inlier_indices = Vector::<i32>::new();
     let is_solved = calib3d::solve_pnp_ransac(
         &places,
         &pixels,
@@ -166,10 +166,10 @@ fn solve(
         RANSAC_ROUNDS,
         threshold_px as f32,
         RANSAC_CONFIDENCE,
-        &mut inliers,
+        &mut inlier_indices,
         SolvePnPMethod::SOLVEPNP_AP3P as i32,
     )?;
-    let inliers: Vec<usize> = inliers
+    let inliers: Vec<usize> = inlier_indices
         .iter()
         .filter_map(|index| usize::try_from(index).ok())
         .collect();
@@ -244,7 +244,9 @@ fn sigmas(
             roll_rad: mount.roll_rad + change[2],
             ..*mount
         };
-        let [x_m, y_m, turn_rad] = [change[3], change[4], change[5]];
+        let x_m = change[3];
+        let y_m = change[4];
+        let turn_rad = change[5];
         let pose = Pose::new(
             pose.position.x + x_m,
             pose.position.y + y_m,

@@ -175,10 +175,10 @@ impl CocoDetector {
         let mut outputs = Vector::<Mat>::new();
         let names: Vector<String> = ["boxes", "scores"].into_iter().collect();
         self.net.forward(&mut outputs, &names)?;
-        let boxes = outputs.get(0)?;
-        let scores = outputs.get(1)?;
-        let boxes = boxes.data_typed::<f32>()?;
-        let scores = scores.data_typed::<f32>()?;
+        let box_output = outputs.get(0)?;
+        let score_output = outputs.get(1)?;
+        let boxes = box_output.data_typed::<f32>()?;
+        let scores = score_output.data_typed::<f32>()?;
         let count = self.anchors.len();
         let classes = labels::CLASSES;
         if boxes.len() != count * 4 || scores.len() != count * classes {

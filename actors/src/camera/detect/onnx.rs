@@ -162,7 +162,7 @@ pub enum OnnxError {
     },
     /// The network takes another size than the configured one.
     #[error(
-        "model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size"
+        "model {path:?} takes images of {taken}, not {configured}: remove `input_px` or export it for that size"
     )]
     OtherSize {
         /// Path of the model file.
@@ -170,7 +170,7 @@ pub enum OnnxError {
         /// Size of the network.
         taken: ImageSize,
         /// Size that `input_px` configures.
-        told: ImageSize,
+        configured: ImageSize,
     },
     /// The network fails at the configured size.
     #[error(
@@ -378,7 +378,7 @@ impl OnnxDetector {
             .join(" ");
         let background_first = names.as_ref().is_some_and(|stated| stated.has_background);
         let clues = Clues {
-            told: config.family,
+            configured: config.family,
             first_class: config.first_class.or(background_first.then_some(1)),
             description: &description,
             input: size,

@@ -220,7 +220,7 @@ fn source_texts_hide_password() {
         for text in said {
             assert!(!text.contains("eim1") && !text.contains("Geh"), "{text}");
         }
-        assert_eq!(source.forget_credentials(), Some("url"));
+        assert_eq!(source.remove_credentials(), Some("url"));
         assert!(!format!("{source:?}").contains("eim1"), "{source:?}");
 
         let quote = if password.contains('"') { '\'' } else { '"' };
@@ -229,7 +229,7 @@ fn source_texts_hide_password() {
         };
         let error = pipeline.validate().expect_err("no appsink").to_string();
         assert!(!error.contains("eim1") && !error.contains("Geh"), "{error}");
-        assert_eq!(pipeline.forget_credentials(), Some("pipeline"));
+        assert_eq!(pipeline.remove_credentials(), Some("pipeline"));
         assert!(!format!("{pipeline:?}").contains("eim1"), "{pipeline:?}");
     }
 }

@@ -53,8 +53,8 @@ impl V4l2Camera {
             }
         };
         std::fs::File::open(device).map_err(|error| failed(error.to_string()))?;
-        let camera = Device::open(device).map_err(refused("it is no camera"))?;
-        let able = camera
+        let opened = Device::open(device).map_err(refused("it is no camera"))?;
+        let able = opened
             .capabilities()
             .map_err(refused("it is no camera"))?
             .device_capabilities();
@@ -63,7 +63,7 @@ impl V4l2Camera {
                 "it streams no pictures: a camera may have several devices, try the others".into(),
             ));
         }
-        let offered = camera
+        let offered = opened
             .formats(BufType::VIDEO_CAPTURE)
             .map(|format| Ok(format?.pixel_format()))
             .collect::<io::Result<Vec<_>>>()
@@ -75,7 +75,7 @@ impl V4l2Camera {
             ))
         })?;
         let [width, height] = [0, 1].map(|side| size[side].unwrap_or(DEFAULT_SIZE[side]));
-        let camera = camera
+        let camera = opened
             .video_capture(PixFormat::new(width, height, conversion.format()))
             .map_err(refused("it refuses the format"))?;
         let layout = FrameLayout::new(conversion, camera.format()).map_err(failed)?;

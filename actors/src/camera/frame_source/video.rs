@@ -177,11 +177,11 @@ impl VideoProcess {
             .0
             .wait()
             .map_or_else(|error| error.to_string(), |status| status.to_string());
-        let words = self.last_words.wait();
-        let words = if words.is_empty() {
-            words
+        let last_words = self.last_words.wait();
+        let words = if last_words.is_empty() {
+            last_words
         } else {
-            format!(": {words}")
+            format!(": {last_words}")
         };
         self.lost(format!("{PROGRAM} ended, {status}{words}"))
     }

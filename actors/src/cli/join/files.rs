@@ -57,11 +57,14 @@ struct MembershipSection<'a> {
 impl NodeDirectory {
     /// The given directory, or this user's default directory; it is created if missing.
     pub(super) fn new(given: Option<&Path>) -> anyhow::Result<Self> {
-        let path = given.unwrap_or(installation::directory());
-        let made = DirBuilder::new().recursive(true).mode(0o750).create(path);
+        let requested = given.unwrap_or(installation::directory());
+        let made = DirBuilder::new()
+            .recursive(true)
+            .mode(0o750)
+            .create(requested);
         let path = made
-            .and_then(|()| path.canonicalize())
-            .with_context(|| format!("cannot use {}", path.display()))?;
+            .and_then(|()| requested.canonicalize())
+            .with_context(|| format!("cannot use {}", requested.display()))?;
         let is_service = is_root() && path == Path::new(SERVICE_DIRECTORY);
         Ok(Self {
             path,

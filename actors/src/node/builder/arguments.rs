@@ -243,13 +243,13 @@ impl NodeBuilder {
                             broker: broker.clone(),
                             node,
                         };
-                        election.send(LeaderElectionMessage::Note { input });
+                        election.send(LeaderElectionMessage::Record { input });
                     }
                     let input = Input::LinkChanged {
                         broker: broker.clone(),
                         state: *state,
                     };
-                    election.send(LeaderElectionMessage::Note { input })
+                    election.send(LeaderElectionMessage::Record { input })
                 }
                 // Only pages use it.
                 Incoming::StatusWithdrawn { .. } => true,

@@ -39,7 +39,7 @@ impl NodeBuilder {
         };
         self.slots()
             .election
-            .send(LeaderElectionMessage::Note { input });
+            .send(LeaderElectionMessage::Record { input });
     }
 
     /// Records values that look as if they were in another unit.

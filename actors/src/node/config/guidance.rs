@@ -26,15 +26,15 @@ impl NodeConfig {
                 "another node joins by `ecod-node --name NAME --cell {cell}{seed}`{key}"
             );
         };
-        let directory = tls.ca.parent().unwrap_or(Path::new("."));
-        if !directory.join("pki").exists() {
+        let parent = tls.ca.parent().unwrap_or(Path::new("."));
+        if !parent.join("pki").exists() {
             return "another node joins by `ecod-node invite NAME` on the machine where `ecod-node init` made the cell"
                 .to_owned();
         }
-        let directory = if directory == Path::new(SERVICE_DIRECTORY) {
+        let directory = if parent == Path::new(SERVICE_DIRECTORY) {
             String::new()
         } else {
-            format!("--dir {} ", directory.display())
+            format!("--dir {} ", parent.display())
         };
         format!("another node joins by `ecod-node invite {directory}NAME`")
     }

@@ -54,7 +54,7 @@ impl NodeConfig {
         }
         #[cfg(feature = "camera")]
         for camera in shown.camera.iter_mut().chain(&mut shown.cameras) {
-            if let Some(key) = camera.source.forget_credentials() {
+            if let Some(key) = camera.source.remove_credentials() {
                 let of = camera
                     .name
                     .as_ref()

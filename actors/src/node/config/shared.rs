@@ -275,8 +275,8 @@ impl NodeConfig {
             |error: &dyn std::fmt::Display| DescriptionError::Malformed(error.to_string());
         let described =
             serde_json::to_value(SharedConfig::parse(text)?).map_err(|error| malformed(&error))?;
-        let keys = toml::from_str::<toml::Table>(text).map_err(|error| malformed(&error))?;
-        let keys = serde_json::to_value(keys).map_err(|error| malformed(&error))?;
+        let table = toml::from_str::<toml::Table>(text).map_err(|error| malformed(&error))?;
+        let keys = serde_json::to_value(table).map_err(|error| malformed(&error))?;
         let mut shared =
             serde_json::to_value(SharedConfig::of(self)).map_err(|error| malformed(&error))?;
         for path in leaves(&keys) {

@@ -99,14 +99,14 @@ impl Default for History {
 impl History {
     /// The whole history as JSON, with the samples and events after `time` only.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
-        let samples: Vec<_> = self
+        let newer: Vec<_> = self
             .samples
             .iter()
             .filter(|(at, _)| *at > time)
             .map(|(_, sample)| &**sample)
             .collect();
         let terms = json(&self.terms);
-        let samples = samples.join(&b',');
+        let samples = newer.join(&b',');
         let failovers = json(&self.failovers);
         let head = &b"{\"reigns\":"[..];
         let timeline = self.timeline.json_since(time);

@@ -229,8 +229,8 @@ impl LiveState {
         let latest = self.latest();
         let living = || {
             let statuses = latest.statuses.values().map(|reported| &reported.status);
-            let told = statuses.filter(|status| status.state != NodeState::Offline);
-            told.flat_map(|status| {
+            let online = statuses.filter(|status| status.state != NodeState::Offline);
+            online.flat_map(|status| {
                 status
                     .troubles
                     .iter()

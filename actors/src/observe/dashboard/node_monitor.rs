@@ -50,7 +50,7 @@ const PROBE_PERIOD: Duration = Duration::from_millis(500);
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
 /// Time between two updates of the timeline.
-const LOOK_PERIOD: Duration = Duration::from_secs(1);
+const CHECK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Frame of a server-sent event around the JSON of a snapshot.
 const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
@@ -181,7 +181,7 @@ impl NodeMonitor {
         let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
         let mut members = self.sources.members.clone();
         let mut samples = ticks(SAMPLE_PERIOD);
-        let mut looks = ticks(LOOK_PERIOD);
+        let mut checks = ticks(CHECK_PERIOD);
         let mut next_snapshot = Instant::now();
         let mut changed = true;
         let mut sent_at = Instant::now();
@@ -208,7 +208,7 @@ impl NodeMonitor {
                 }
                 Ok(()) = members.changed() => changed = true,
                 _ = samples.tick() => self.sample(),
-                _ = looks.tick() => self.extend_timeline(),
+                _ = checks.tick() => self.extend_timeline(),
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
                     let event = self.cached_event();
                     self.snapshots.send_replace(event.value);

@@ -246,9 +246,9 @@ impl ThinnedSeries {
 
     /// All items in order of time, as a JSON array.
     pub(crate) fn json(&self) -> Vec<u8> {
-        let mut items: Vec<_> = self.items.iter().collect();
-        items.sort_by_key(|(at, _)| *at);
-        let items: Vec<_> = items.into_iter().map(|(_, item)| &**item).collect();
+        let mut ordered: Vec<_> = self.items.iter().collect();
+        ordered.sort_by_key(|(at, _)| *at);
+        let items: Vec<_> = ordered.into_iter().map(|(_, item)| &**item).collect();
         [&b"["[..], &items.join(&b','), b"]"].concat()
     }
 }

@@ -465,8 +465,9 @@ mod tests {
         writer.write(&entry(2));
         writer.flush();
         writer.write(&entry(3));
-        let [recorded, failed, dropped] =
-            [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
+        let recorded = Event::Recorded;
+        let failed = Event::RecordFailed;
+        let dropped = Event::RecordDropped;
         assert_eq!(
             [recorded, failed, dropped].map(|event| counters.events(event)),
             [2, 1, 1]

@@ -47,18 +47,18 @@ impl Plot<'_> {
     pub(super) fn draw(&self) -> String {
         let points = || self.curves.iter().flat_map(|curve| &curve.points);
         let scale = Scale::new(self.x, points().map(|point| point.0));
-        let y_max = points()
+        let highest = points()
             .filter(|point| scale.shows(point.0))
             .map(|point| point.1)
             .fold(0.0, f64::max)
             .max(1e-9);
-        let y_step = step(y_max * 1.05);
-        let y_max = (y_max / y_step).ceil() * y_step;
+        let y_step = step(highest * 1.05);
+        let y_max = (highest / y_step).ceil() * y_step;
         let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * scale.share(value);
         let y = |value: f64| HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * value / y_max;
         let mut picture = picture(self.title, HEIGHT);
         for value in ticks(y_step, y_max) {
-            picture = picture.add(line("grid", (LEFT, y(value)), (WIDTH - RIGHT, y(value))));
+            picture = picture.add(line("grid", LEFT, y(value), WIDTH - RIGHT, y(value)));
             picture = picture.add(text(
                 "tick",
                 "end",
@@ -79,8 +79,10 @@ impl Plot<'_> {
         picture = picture
             .add(line(
                 "axis",
-                (LEFT, HEIGHT - BOTTOM),
-                (WIDTH - RIGHT, HEIGHT - BOTTOM),
+                LEFT,
+                HEIGHT - BOTTOM,
+                WIDTH - RIGHT,
+                HEIGHT - BOTTOM,
             ))
             .add(text(
                 "label",
@@ -91,7 +93,7 @@ impl Plot<'_> {
             ))
             .add(text("label", "start", 4.0, TOP - 12.0, self.y_label));
         for (at, what) in &self.marks {
-            let mark = line("mark", (x(*at), TOP), (x(*at), HEIGHT - BOTTOM));
+            let mark = line("mark", x(*at), TOP, x(*at), HEIGHT - BOTTOM);
             picture = picture.add(Group::new().add(mark).add(Title::new(what.as_str())));
         }
         for (index, curve) in self.curves.iter().enumerate() {
@@ -225,13 +227,14 @@ fn picture(title: &str, height: f64) -> Document {
         .set("preserveAspectRatio", "xMinYMin meet")
 }
 
-fn line(class: &str, from: (f64, f64), to: (f64, f64)) -> Line {
+fn line(class: &str, x1: f64, y1: f64, x2: f64, y2: f64) -> Line {
     let round = |value: f64| format!("{value:.1}");
-    let line = Line::new()
+    Line::new()
         .set("class", class)
-        .set("x1", round(from.0))
-        .set("y1", round(from.1));
-    line.set("x2", round(to.0)).set("y2", round(to.1))
+        .set("x1", round(x1))
+        .set("y1", round(y1))
+        .set("x2", round(x2))
+        .set("y2", round(y2))
 }
 
 fn text(class: &str, anchor: &str, x: f64, y: f64, content: &str) -> Text {

@@ -223,9 +223,9 @@ impl LogTimeline {
             [b",\"pictures\":", &self.pictures.json()],
             [b",\"landmarks\":", &json(&self.landmarks)],
         ];
-        let data = fields.map(|field| field.concat()).concat();
+        let bytes = fields.map(|field| field.concat()).concat();
         // Names in the log must not end the element.
-        let data = String::from_utf8_lossy(&data).replace('<', "\\u003c");
+        let data = String::from_utf8_lossy(&bytes).replace('<', "\\u003c");
         let view = assets::view();
         let script = assets::view_script() + include_str!("report.js");
         format!(

@@ -59,9 +59,9 @@ pub(super) async fn read(
     if let Some(level) = level(&body).filter(|level| !LEVELS.contains(level)) {
         return Err(ClientRejection::UnknownVersion(level));
     }
-    let client_id = client_id(&body);
-    let has_generated_id = client_id.is_some_and(<[u8]>::is_empty);
-    let client_id = String::from_utf8_lossy(client_id.unwrap_or_default()).into_owned();
+    let id_bytes = client_id(&body);
+    let has_generated_id = id_bytes.is_some_and(<[u8]>::is_empty);
+    let client_id = String::from_utf8_lossy(id_bytes.unwrap_or_default()).into_owned();
     packet.append(&mut body);
     Ok(ConnectPacket {
         packet,

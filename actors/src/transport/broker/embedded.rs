@@ -310,10 +310,10 @@ impl MqttBroker for EmbeddedBroker {
         else {
             return;
         };
-        let told = stop.send(()).is_ok();
+        let is_sent = stop.send(()).is_ok();
         if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
             tracing::error!(%address, "embedded broker does not answer; its thread is abandoned");
-        } else if thread.join().is_err() || !told {
+        } else if thread.join().is_err() || !is_sent {
             tracing::warn!(%address, "broker had ended by itself");
         }
     }

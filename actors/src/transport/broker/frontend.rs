@@ -255,12 +255,12 @@ impl FrontendState {
             .map(|(current, own)| current.borrow().subject_of(own))
             .transpose()
             .map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
-        let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
-        let is_program = self.door.is_program(&principal, &connect.client_id);
+        let client = Principal::new(identity, from.ip(), connect.has_generated_id);
+        let is_program = self.door.is_program(&client, &connect.client_id);
         let principal = if is_program {
-            principal.programs()
+            client.programs()
         } else {
-            principal
+            client
         };
         let _part = self
             .quota

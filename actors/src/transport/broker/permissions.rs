@@ -80,7 +80,7 @@ impl Permissions {
         let Some(principal) = self.principals.principal(info.id().remote_addr) else {
             return false;
         };
-        let may_say = |will: LastWill<'_>| {
+        let may_publish_will = |will: LastWill<'_>| {
             let (topic, retain, bytes) = match will {
                 LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
                 LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
@@ -95,7 +95,8 @@ impl Permissions {
         let is_own = |identity: &Arc<CertificateSubject>| {
             principal.has_generated_id || may_use_client_id(identity, info.client_id())
         };
-        principal.identity.as_ref().is_none_or(is_own) && info.last_will().is_none_or(may_say)
+        principal.identity.as_ref().is_none_or(is_own)
+            && info.last_will().is_none_or(may_publish_will)
     }
 
     /// Accepts a message, or returns the reason for refusing it.

@@ -65,10 +65,11 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
 ) -> Result<WebSocketBytes<impl AsyncRead + AsyncWrite + Unpin>, ClientRejection> {
     let (reader, mut writer) = tokio::io::split(stream);
     let counter = Arc::clone(&wire_bytes);
-    let reader = InspectReader::new(reader, move |bytes| {
+    let counting = InspectReader::new(reader, move |bytes| {
         counter.fetch_add(bytes.len(), Ordering::Relaxed);
     });
-    let mut reader = BufReader::with_capacity(REQUEST_BUFFER_BYTES, reader.take(MAX_REQUEST_BYTES));
+    let mut reader =
+        BufReader::with_capacity(REQUEST_BUFFER_BYTES, counting.take(MAX_REQUEST_BYTES));
     let mut request = vec![FIRST_BYTE];
     while !request.ends_with(b"\r\n\r\n") {
         if reader.read_until(b'\n', &mut request).await? == 0 {

@@ -61,7 +61,7 @@ const PEER_COOKIE: Cookie = [8; 16];
 
 impl Listener {
     /// A node and its peer, after their handshake, in a cell with certificates or without.
-    pub fn meet(proves: bool) -> Self {
+    pub fn member_up(proves: bool) -> Self {
         let mut listener = Self::alone(proves);
         let mut peer = machine(PEER, 1, proves, listener.now);
         let Self { own, now, .. } = &mut listener;
@@ -79,7 +79,7 @@ impl Listener {
                         GossipOutput::Send { frame, .. } | GossipOutput::Multicast { frame } => {
                             under_way.push_back((index, frame))
                         }
-                        GossipOutput::Tell(_) | GossipOutput::Renewal { .. } => (),
+                        GossipOutput::Event(_) | GossipOutput::Renewal { .. } => (),
                     }
                 }
             }

@@ -41,7 +41,7 @@ pub(crate) enum GossipOutput {
     /// Send a datagram to the multicast group.
     Multicast { frame: Vec<u8> },
     /// Deliver an event.
-    Tell(MembershipEvent),
+    Event(MembershipEvent),
     /// Answer a message about a renewed certificate.
     Renewal {
         from: NodeName,
@@ -219,7 +219,7 @@ impl GossipMachine {
         for GossipNotice { about, kind, cause } in self.sessions.take_notices() {
             if self.notices.allow(at) {
                 let event = MembershipEvent::Troubled { about, kind, cause };
-                self.outputs.push_back(GossipOutput::Tell(event));
+                self.outputs.push_back(GossipOutput::Event(event));
             }
         }
         self.flush_swim(at);
@@ -262,7 +262,7 @@ impl GossipMachine {
             .alive()
             .get(to)
             .map(|id| id.gossip)
-            .or_else(|| self.sessions.heard_at(to, at));
+            .or_else(|| self.sessions.recent_address(to, at));
         match address {
             Some(address) if !self.left => {
                 self.send_or_queue(to, address, kind, payload, at);
@@ -289,7 +289,7 @@ impl GossipMachine {
             tracing::warn!(node = %name, "session ended: its certificate was revoked or has expired");
             self.gossip.remove(&name, at);
             self.outputs
-                .push_back(GossipOutput::Tell(MembershipEvent::Expelled { name }));
+                .push_back(GossipOutput::Event(MembershipEvent::Expelled { name }));
         }
         for address in greeted {
             self.send_hello(address, true, at);
@@ -310,7 +310,7 @@ impl GossipMachine {
             self.send_hello(address, true, at);
         }
         self.outputs
-            .push_back(GossipOutput::Tell(MembershipEvent::Moved));
+            .push_back(GossipOutput::Event(MembershipEvent::Moved));
         self.flush_swim(at);
     }
 
@@ -349,7 +349,7 @@ impl GossipMachine {
             FrameContent::Answer(frame) => self
                 .outputs
                 .push_back(GossipOutput::Send { to: from, frame }),
-            FrameContent::Met {
+            FrameContent::Introduced {
                 introduction,
                 answer,
                 speaks,
@@ -359,17 +359,17 @@ impl GossipMachine {
                 self.outputs
                     .extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
                 let name = introduction.id.name.clone();
-                self.meet(introduction, from, speaks, greeter, at);
+                self.on_introduction(introduction, from, speaks, greeter, at);
                 let moved = self.gossip.alive().get(&name).filter(|_| has_moved);
                 if let Some(id) = moved {
                     let member = self.member(id);
                     let event = MembershipEvent::Changed { member };
-                    self.outputs.push_back(GossipOutput::Tell(event));
+                    self.outputs.push_back(GossipOutput::Event(event));
                 }
             }
             FrameContent::Gossip { from, body } => {
-                let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);
-                self.gossip.receive(&from, &body, &is_heard, at)?;
+                let has_received = |name: &NodeName| self.sessions.has_received(name, at);
+                self.gossip.receive(&from, &body, &has_received, at)?;
             }
             FrameContent::Payload { from, rights, body } => {
                 let event = MembershipEvent::Received {
@@ -378,7 +378,7 @@ impl GossipMachine {
                     payload: Bytes::from(body),
                     received_at: now,
                 };
-                self.outputs.push_back(GossipOutput::Tell(event));
+                self.outputs.push_back(GossipOutput::Event(event));
             }
             FrameContent::Renewal {
                 from,
@@ -391,7 +391,7 @@ impl GossipMachine {
             }),
             FrameContent::Stranger => self.send_hello(from, true, at),
             FrameContent::NameTaken(name) => self.report_taken(&name, second_run(from), at),
-            FrameContent::Namesake { id, answer } => self.meet_namesake(&id, answer, from, at),
+            FrameContent::Namesake { id, answer } => self.on_namesake(&id, answer, from, at),
             FrameContent::Nothing => (),
         }
         Ok(())
@@ -400,7 +400,7 @@ impl GossipMachine {
     /// Processes the handshake of an admitted node: its claims to this node's name, then its
     /// identity. `speaks` is true if its session is accepted for its name, `greeter` if this node
     /// began the handshake.
-    fn meet(
+    fn on_introduction(
         &mut self,
         introduction: Introduction,
         from: SocketAddr,
@@ -465,13 +465,13 @@ impl GossipMachine {
                     member: self.member(&id),
                 },
                 SwimOutput::Unproven(id) => {
-                    self.meet_unproven(id, at);
+                    self.greet_unproven(id, at);
                     continue;
                 }
                 SwimOutput::Suspected(name) => MembershipEvent::Suspected { name },
                 SwimOutput::Down(name) => MembershipEvent::Down { name },
             };
-            self.outputs.push_back(GossipOutput::Tell(event));
+            self.outputs.push_back(GossipOutput::Event(event));
         }
     }
 
@@ -487,7 +487,7 @@ impl GossipMachine {
         if let Some((address, frame)) = self.sessions.seal(to, kind, body, at) {
             self.outputs
                 .push_back(GossipOutput::Send { to: address, frame });
-            if let Some(address) = self.sessions.unheard(to, at) {
+            if let Some(address) = self.sessions.silent_address(to, at) {
                 self.send_hello(address, true, at);
             }
             return;
@@ -514,7 +514,7 @@ impl GossipMachine {
     }
 
     /// Greets a node that other nodes mention and whose certificate this node has not seen.
-    fn meet_unproven(&mut self, id: NodeId, at: Timestamp) {
+    fn greet_unproven(&mut self, id: NodeId, at: Timestamp) {
         self.unproven
             .retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
         let is_new = self.unproven.len() < MAX_UNPROVEN && !self.unproven.contains_key(&id.name);
@@ -569,7 +569,7 @@ impl GossipMachine {
                     "this seed does not answer: it does not run, its cell or key is another, or UDP does not pass";
                 let about = seed.to_string();
                 let kind = TroubleKind::SeedSilent;
-                GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause: cause.into() })
+                GossipOutput::Event(MembershipEvent::Troubled { about, kind, cause: cause.into() })
             }));
         }
     }
@@ -600,7 +600,7 @@ impl GossipMachine {
             let about = name.to_string();
             let kind = TroubleKind::NameTaken;
             self.outputs
-                .push_back(GossipOutput::Tell(MembershipEvent::Troubled {
+                .push_back(GossipOutput::Event(MembershipEvent::Troubled {
                     about,
                     kind,
                     cause,
@@ -611,7 +611,7 @@ impl GossipMachine {
     /// Handles another node with this node's name: informs it that it is the second one, or accepts
     /// that this node is. A node that has just started is the second one; if the two discover each
     /// other late, it is the node that started later.
-    fn meet_namesake(
+    fn on_namesake(
         &mut self,
         id: &NodeId,
         answer: Option<Vec<u8>>,
@@ -636,7 +636,7 @@ impl GossipMachine {
         let since = *self.excluded_since.get_or_insert(at);
         if at.since(since) >= NAME_PATIENCE && self.gossip.alive().is_empty() {
             self.outputs
-                .push_back(GossipOutput::Tell(MembershipEvent::Excluded));
+                .push_back(GossipOutput::Event(MembershipEvent::Excluded));
         }
         let cause = format!(
             "the node at {informant} reports that another running node has this name; this node does not join"

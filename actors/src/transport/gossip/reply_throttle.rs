@@ -49,7 +49,7 @@ impl ReplyThrottle {
 
     /// Gives a host room of its own, because a node was admitted from there. The host whose last
     /// admission is oldest is dropped if there is no room.
-    pub(crate) fn know(&mut self, from: SocketAddr, now: Timestamp) {
+    pub(crate) fn admit(&mut self, from: SocketAddr, now: Timestamp) {
         let host = host_network(from.ip());
         if !self.known.contains_key(&host) && self.known.len() >= MAX_KNOWN {
             let oldest = self
@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn flood_leaves_verified_host_share() {
         let mut throttle = ReplyThrottle::new(Timestamp(0));
-        throttle.know(address(7), Timestamp(0));
+        throttle.admit(address(7), Timestamp(0));
         assert_eq!(verified_beside_a_flood(&mut throttle, 7), 20);
         let mut throttle = ReplyThrottle::new(Timestamp(0));
         assert!(
@@ -115,7 +115,7 @@ mod tests {
     fn verified_hosts_are_bounded() {
         let mut throttle = ReplyThrottle::new(Timestamp(0));
         (0..2 * MAX_KNOWN as u32)
-            .for_each(|host| throttle.know(address(host), Timestamp(host.into())));
+            .for_each(|host| throttle.admit(address(host), Timestamp(host.into())));
         assert_eq!(throttle.known.len(), MAX_KNOWN);
         assert!(
             !throttle.known.contains_key(&address(0).ip()),

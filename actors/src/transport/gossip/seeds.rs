@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tokio::net::lookup_host;
 
-/// Resolves the seeds repeatedly, sooner while one has failed, until `tell` returns false.
+/// Resolves the seeds repeatedly, sooner while one has failed, until `deliver` returns false.
 /// `trouble` is called for each failure.
 ///
 /// A seed whose resolution fails keeps its addresses: the name server may be unreachable together
@@ -16,7 +16,7 @@ pub(crate) async fn resolve(
     seeds: Vec<String>,
     ipv4: bool,
     trouble: impl Fn(&str, &io::Error),
-    tell: impl Fn(Vec<SocketAddr>) -> bool,
+    deliver: impl Fn(Vec<SocketAddr>) -> bool,
 ) {
     let mut retry = RETRY_MIN;
     let mut unresolved = BTreeSet::new();
@@ -25,7 +25,7 @@ pub(crate) async fn resolve(
         resolve_once(&seeds, ipv4, &mut known, &mut unresolved, &trouble).await;
         let addresses = known.values().flatten().copied().collect();
         let complete = unresolved.is_empty();
-        if !tell(addresses) {
+        if !deliver(addresses) {
             return;
         }
         let wait = if complete { REFRESH } else { retry };

@@ -102,7 +102,7 @@ pub(crate) enum FrameContent {
     /// A step of a handshake, with the answer to send.
     Answer(Vec<u8>),
     /// A node was admitted. The answer informs the node, unless it already has the session.
-    Met {
+    Introduced {
         introduction: Introduction,
         answer: Option<Vec<u8>>,
         /// True if its session is accepted for its name.
@@ -199,7 +199,7 @@ impl Sessions {
     ) -> Option<(SocketAddr, Vec<u8>)> {
         let head = self.head(kind);
         let peer = self.peers.speaker_mut(to)?;
-        peer.unheard_since.get_or_insert(now);
+        peer.unanswered_since.get_or_insert(now);
         Some((
             peer.address,
             head.write(self.key.tag(), body, peer.keys.to()?),
@@ -207,13 +207,13 @@ impl Sessions {
     }
 
     /// Address of a node that has not answered for a while and must be greeted for a new session.
-    pub(crate) fn unheard(&mut self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
+    pub(crate) fn silent_address(&mut self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let proves = self.prove_certificates();
         let peer = self.peers.speaker_mut(name).filter(|_| proves)?;
         let since = peer
-            .unheard_since
-            .filter(|since| now.since(*since) >= UNHEARD_TIMEOUT)?;
-        peer.unheard_since = Some(now.max(since));
+            .unanswered_since
+            .filter(|since| now.since(*since) >= ANSWER_TIMEOUT)?;
+        peer.unanswered_since = Some(now.max(since));
         Some(peer.address)
     }
 
@@ -230,16 +230,16 @@ impl Sessions {
     }
 
     /// True if a frame of the node was received a moment ago.
-    pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
+    pub(crate) fn has_received(&self, name: &NodeName, now: Timestamp) -> bool {
         self.peers
             .speaker(name)
-            .is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
+            .is_some_and(|peer| now.since(peer.received_at) < RECENT_TIME)
     }
 
     /// Address of the node of a name, if a frame of it was received recently.
-    pub(crate) fn heard_at(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
+    pub(crate) fn recent_address(&self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let peer = self.peers.speaker(name)?;
-        (now.since(peer.heard) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
+        (now.since(peer.received_at) < SESSION_IDLE_TIMEOUT).then_some(peer.address)
     }
 
     /// True if a single node may be greeted now.
@@ -295,7 +295,7 @@ impl Sessions {
 
     /// Removes all sessions, as if other sessions had replaced them.
     #[cfg(test)]
-    pub(crate) fn forget_all(&mut self) {
+    pub(crate) fn drop_all(&mut self) {
         self.peers.expel(|_| true);
     }
 
@@ -498,14 +498,14 @@ const SESSION_IDLE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Time after a frame of a node during which other nodes' statements that it is down or elsewhere
 /// are ignored. It is about as long as the gossip takes to detect that a node is down.
-const HEARD_TIME: Duration = Duration::from_millis(400);
+const RECENT_TIME: Duration = Duration::from_millis(400);
 
 /// Time for which frames of a node's earlier run may still arrive.
 const MAX_TRANSIT: Duration = Duration::from_millis(500);
 
 /// Time without an answer after which a new session is requested from a node: it may have lost the
 /// keys.
-const UNHEARD_TIMEOUT: Duration = Duration::from_millis(500);
+const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub(super) fn encode(message: &impl Serialize) -> Vec<u8> {

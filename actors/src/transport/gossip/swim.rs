@@ -119,13 +119,13 @@ impl Swim {
 
     /// Processes a message that `from` has authenticated.
     ///
-    /// In a cell with certificates, frames received directly from a node (`is_heard`) outweigh
+    /// In a cell with certificates, frames received directly from a node (`has_received`) outweigh
     /// other nodes' statements about it.
     pub(crate) fn receive(
         &mut self,
         from: &NodeName,
         body: &[u8],
-        is_heard: &dyn Fn(&NodeName) -> bool,
+        has_received: &dyn Fn(&NodeName) -> bool,
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
         let mut updates = body;
@@ -139,7 +139,7 @@ impl Swim {
         }
         let result = if self.lives.is_some() {
             let body = self
-                .without_hearsay(&header.src, body, updates, is_heard)
+                .without_secondhand(&header.src, body, updates, has_received)
                 .map_err(|_| FrameEvent::Malformed)?;
             self.foca.handle_data(&body, &mut self.runtime)
         } else {
@@ -152,12 +152,12 @@ impl Swim {
     /// Removes second-hand statements from a message: news of nodes that this node has not
     /// admitted, lives that a node has not claimed itself, and suspicions of nodes that this node
     /// receives directly. `updates` is the part of `body` behind its header.
-    fn without_hearsay(
+    fn without_secondhand(
         &mut self,
         from: &NodeId,
         body: &[u8],
         updates: &[u8],
-        is_heard: &dyn Fn(&NodeName) -> bool,
+        has_received: &dyn Fn(&NodeName) -> bool,
     ) -> Result<Vec<u8>, postcard::Error> {
         let Some((count, mut rest)) = updates.split_first_chunk::<2>() else {
             return Ok(body.to_vec());
@@ -176,7 +176,7 @@ impl Swim {
                 _ if id.name == self.foca.identity().name => kept_updates.push(update),
                 Some(life) if id.life <= *life => {
                     let is_doubt = update.state() != State::Alive && id.name != from.name;
-                    if !is_doubt || !is_heard(&id.name) {
+                    if !is_doubt || !has_received(&id.name) {
                         kept_updates.push(update);
                     }
                 }

@@ -103,11 +103,11 @@ impl Joined {
     /// Returns an error if the host does not acknowledge the confirmation: it will then revoke the
     /// certificate.
     pub async fn keep(mut self) -> io::Result<()> {
-        let told = async {
+        let conversation = async {
             write_line(&mut self.stream, &KEPT).await?;
             read_line::<String>(&mut self.stream, MAX_REQUEST_BYTES).await
         };
-        timeout(CONVERSATION_TIME, told).await?.map(drop)
+        timeout(CONVERSATION_TIME, conversation).await?.map(drop)
     }
 }
 

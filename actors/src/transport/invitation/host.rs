@@ -92,7 +92,7 @@ impl Host {
         let private = PrivateKeyDer::from(PrivatePkcs8KeyDer::from(key.serialize_der()));
         let chain = vec![CertificateDer::from(certificate.der().to_vec())];
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let tls = ServerConfig::builder_with_provider(provider)
+        let config = ServerConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&rustls::version::TLS13])
             .and_then(|builder| {
                 builder
@@ -100,7 +100,7 @@ impl Host {
                     .with_single_cert(chain, private)
             })
             .map_err(|error| AuthorityError::Crypto(error.to_string()))?;
-        let tls = TlsAcceptor::from(Arc::new(tls));
+        let tls = TlsAcceptor::from(Arc::new(config));
         Ok(Self {
             authority,
             cell_key,
@@ -153,7 +153,7 @@ impl Host {
         mut self,
         listener: TcpListener,
         until: Instant,
-        tell: impl Fn(Visit),
+        report: impl Fn(Visit),
     ) -> Vec<NodeName> {
         let mut visits = JoinSet::new();
         let mut failures = BTreeSet::new();
@@ -178,7 +178,7 @@ impl Host {
                     let is_again = self.guests.get(&request.node).is_some_and(|guest| guest.issued.is_some());
                     let given = self.answer(&request);
                     if is_again && given.1.is_some() {
-                        tell(Visit::UsedAgain(request.node));
+                        report(Visit::UsedAgain(request.node));
                     }
                     // A guest that has left does not wait for it.
                     let _ = answer.send(given);
@@ -186,12 +186,12 @@ impl Host {
                 Some(Ok(visit)) = visits.join_next() => match visit {
                     Ok((_, node, serial)) if self.guests.get(&node).is_some_and(|guest| guest.issued == serial) => {
                         self.guests.remove(&node);
-                        tell(Visit::Joined(node));
+                        report(Visit::Joined(node));
                     }
-                    Ok((from, node, _)) => tell(Visit::Failed(from, format!("the token of {node} was used again since"))),
+                    Ok((from, node, _)) => report(Visit::Failed(from, format!("the token of {node} was used again since"))),
                     Err((from, reason)) => {
                         if failures.len() < MAX_FAILURES && failures.insert((from.ip(), reason.clone())) {
-                            tell(Visit::Failed(from, reason));
+                            report(Visit::Failed(from, reason));
                         }
                     }
                 },

@@ -486,7 +486,8 @@ mod tests {
 
     /// The inbox of the edge, with limits for undelivered messages and for reports per second.
     fn inbox(
-        (capacity, max_report_hz): (usize, u32),
+        capacity: usize,
+        max_report_hz: u32,
         counters: &Arc<Counters>,
         receiver: impl Fn(Delivery) + Send + Sync + 'static,
     ) -> Inbox {
@@ -534,7 +535,7 @@ mod tests {
     ) -> (Inbox, impl Fn(&'static str) -> u64) {
         let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
         let receiver = Arc::clone(&taken);
-        let inbox = inbox((16, 30), counters, move |delivery| {
+        let inbox = inbox(16, 30, counters, move |delivery| {
             *receiver
                 .lock()
                 .unwrap()
@@ -551,7 +552,7 @@ mod tests {
         let counters = Arc::new(Counters::default());
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
-        let inbox = inbox((2, 100), &counters, move |delivery| {
+        let inbox = inbox(2, 100, &counters, move |delivery| {
             receiver.lock().unwrap().push(delivery);
         });
         let payload = |aggregator: &str| {

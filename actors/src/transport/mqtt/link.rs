@@ -230,7 +230,7 @@ impl LinkTask {
                         retained it comes again and again: remove it, and have the broker limit its messages");
                 }
             }
-            if !self.tell(LinkChange::Lost(state)) {
+            if !self.report_change(LinkChange::Lost(state)) {
                 return;
             }
             if begun.elapsed() > in_use {
@@ -292,7 +292,7 @@ impl LinkTask {
         counters
             .troubles()
             .settle(setup.unreachable, Some(&self.broker.to_string()));
-        if !self.tell(LinkChange::Accepted {
+        if !self.report_change(LinkChange::Accepted {
             client,
             node: node.clone(),
         }) {
@@ -305,7 +305,7 @@ impl LinkTask {
         // Time spent waiting for this node's own status. A single wait may be a stall and is not
         // enough for a verdict.
         let mut listened = Duration::ZERO;
-        let mut heard_itself = false;
+        let mut received_itself = false;
         loop {
             let polled = Instant::now();
             let packet = connection
@@ -319,7 +319,7 @@ impl LinkTask {
             }
             silent = Duration::ZERO;
             if self.hearing.record() {
-                self.tell(LinkChange::Answered);
+                self.report_change(LinkChange::Answered);
             }
             match packet {
                 Packet::Message { topic, payload } => {
@@ -329,13 +329,13 @@ impl LinkTask {
                     };
                     match sink.accept(via, &topic, &payload, clock::now()) {
                         PacketOutcome::DeclaredOffline => {
-                            self.tell(LinkChange::DeclaredOffline);
+                            self.report_change(LinkChange::DeclaredOffline);
                         }
                         PacketOutcome::Namesake(run) => {
-                            self.tell(LinkChange::Namesake(run));
+                            self.report_change(LinkChange::Namesake(run));
                         }
                         PacketOutcome::OwnStatus => {
-                            heard_itself = true;
+                            received_itself = true;
                             self.end_refusal(|refusal| refusal == NOT_HEARD);
                         }
                         PacketOutcome::Done => {}
@@ -355,7 +355,7 @@ impl LinkTask {
                 // Only the return of the node's own status is decisive.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
-            if !heard_itself
+            if !received_itself
                 && listened > config.connect_timeout()
                 && self.reported_refusal.is_none()
             {
@@ -409,7 +409,7 @@ impl LinkTask {
     }
 
     /// Sends to the gateway; returns false if it has ended.
-    fn tell(&self, change: LinkChange) -> bool {
+    fn report_change(&self, change: LinkChange) -> bool {
         (self.report)(LinkEvent {
             link: self.id,
             change,

@@ -255,11 +255,11 @@ impl Authority {
             .subject_alt_names
             .push(rcgen::SanType::DnsName(DOOR_NAME.try_into()?));
         set_validity(&mut parameters, now, valid);
-        let serial = draw_serial()?;
-        parameters.serial_number = Some(serial.clone());
+        let serial_number = draw_serial()?;
+        parameters.serial_number = Some(serial_number.clone());
         let issuer = self.issuer()?;
         let certificate = parameters.signed_by(key, &issuer)?;
-        let serial = hex::encode(serial.as_ref());
+        let serial = hex::encode(serial_number.as_ref());
         let issued = IssuedCertificate {
             node: node.clone(),
             is_ca: false,

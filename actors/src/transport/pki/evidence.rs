@@ -371,10 +371,8 @@ mod tests {
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, now);
         let gauss = signer(&mut authority, "gauss", Role::Auto, DAY, now);
         let old = signer(&mut authority, "old", Role::Auto, DAY, now - 2 * DAY);
-        let [from_gauss, from_old] = [
-            gauss.sign(share("gauss")).unwrap(),
-            old.sign(share("old")).unwrap(),
-        ];
+        let from_gauss = gauss.sign(share("gauss")).unwrap();
+        let from_old = old.sign(share("old")).unwrap();
         assert!(edge.reload() || edge.verify(&from_gauss).is_ok());
         assert_eq!(edge.verify(&from_old), Err(EvidenceError::Certificate));
         assert_eq!(

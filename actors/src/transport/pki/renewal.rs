@@ -84,10 +84,10 @@ impl NewKey {
         credentials: &Credentials,
     ) -> Result<(), String> {
         let present = credentials.current();
-        let renewed = authority
+        let pem = authority
             .reissue(present.certificate(), &self.key, clock::wall())
             .map_err(|refusal| refusal.to_string())?;
-        let renewed = der_of(&renewed)?;
+        let renewed = der_of(&pem)?;
         self.install(&renewed, credentials)
             .map_err(|error| error.to_string())
     }
@@ -103,8 +103,8 @@ pub(crate) fn renew(
     certificate: &[u8],
     request: Vec<u8>,
 ) -> Result<Vec<u8>, String> {
-    let request = CertificateSigningRequestDer::from(request);
-    let request = CertificateSigningRequestParams::from_der(&request)
+    let der = CertificateSigningRequestDer::from(request);
+    let request = CertificateSigningRequestParams::from_der(&der)
         .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
     let mut authority = Authority::open(directory).map_err(|error| error.to_string())?;
     let renewed = authority

@@ -76,11 +76,11 @@ impl CertificateSubject {
         let may_serve = alternatives
             .iter()
             .any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)));
-        let rights = alternatives.iter().find_map(|name| match name {
+        let stated = alternatives.iter().find_map(|name| match name {
             GeneralName::URI(uri) => uri.strip_prefix(RIGHTS_SCHEME),
             _ => None,
         });
-        let rights = match rights {
+        let rights = match stated {
             _ if !may_serve => Rights::NONE,
             Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
             None => Rights::ALL,

@@ -122,7 +122,7 @@ async fn unusable_boxes_name_reason() {
     )
     .await;
     cell.until("the program can read why", |_| {
-        let published = program.heard_on("nodes/euclid/clients");
+        let published = program.received_on("nodes/euclid/clients");
         let last = published
             .last()
             .map(|heard| serde_json::from_slice::<ClientRefusals>(&heard.payload).unwrap());

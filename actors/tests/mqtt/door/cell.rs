@@ -302,7 +302,7 @@ pub(crate) fn round_of(map: &GlobalMap) -> Round {
 
 /// A message as a program gets it.
 #[derive(Debug, Clone)]
-pub(crate) struct Heard {
+pub(crate) struct ReceivedMessage {
     pub(crate) topic: String,
     pub(crate) payload: Vec<u8>,
     pub(crate) at: Instant,
@@ -311,7 +311,7 @@ pub(crate) struct Heard {
 /// A plain MQTT 5 client.
 pub(crate) struct Program {
     client: AsyncClient,
-    heard: Arc<Mutex<Vec<Heard>>>,
+    received: Arc<Mutex<Vec<ReceivedMessage>>>,
     answers: Arc<Mutex<Vec<(String, String)>>>,
     task: JoinHandle<()>,
 }
@@ -335,16 +335,16 @@ impl Program {
                 .await
                 .unwrap();
         }
-        let heard = Arc::<Mutex<Vec<_>>>::default();
+        let received = Arc::<Mutex<Vec<_>>>::default();
         let answers = Arc::<Mutex<Vec<_>>>::default();
-        let messages = Arc::clone(&heard);
+        let messages = Arc::clone(&received);
         let acknowledgements = Arc::clone(&answers);
         let (ready, mut is_ready) = tokio::sync::mpsc::unbounded_channel();
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {
                     Ok(Event::Incoming(Packet::Publish(publish))) => {
-                        messages.lock().unwrap().push(Heard {
+                        messages.lock().unwrap().push(ReceivedMessage {
                             topic: String::from_utf8(publish.topic.to_vec()).unwrap(),
                             payload: publish.payload.to_vec(),
                             at: Instant::now(),
@@ -374,30 +374,30 @@ impl Program {
         }
         Self {
             client,
-            heard,
+            received,
             answers,
             task,
         }
     }
 
-    pub(crate) fn heard(&self) -> Vec<Heard> {
-        self.heard.lock().unwrap().clone()
+    pub(crate) fn received(&self) -> Vec<ReceivedMessage> {
+        self.received.lock().unwrap().clone()
     }
 
-    pub(crate) fn heard_on(&self, topic: &str) -> Vec<Heard> {
-        self.heard()
+    pub(crate) fn received_on(&self, topic: &str) -> Vec<ReceivedMessage> {
+        self.received()
             .into_iter()
-            .filter(|heard| heard.topic == format!("ecod/v1/lot/{topic}"))
+            .filter(|received| received.topic == format!("ecod/v1/lot/{topic}"))
             .collect()
     }
 
     /// The maps so far, and when they came.
     pub(crate) fn rounds(&self) -> Vec<(Round, Instant)> {
-        let maps = self.heard_on("global_detections").into_iter();
-        maps.map(|heard| {
+        let maps = self.received_on("global_detections").into_iter();
+        maps.map(|received| {
             (
-                round_of(&decode(&heard.payload, &Default::default()).unwrap()),
-                heard.at,
+                round_of(&decode(&received.payload, &Default::default()).unwrap()),
+                received.at,
             )
         })
         .collect()

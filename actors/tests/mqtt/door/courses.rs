@@ -57,7 +57,7 @@ async fn planned_handover_keeps_maps_complete() {
 
 fn messages<T: serde::de::DeserializeOwned>(program: &Program, topic: &str) -> Vec<T> {
     program
-        .heard_on(topic)
+        .received_on(topic)
         .iter()
         .map(|heard| serde_json::from_slice(&heard.payload).unwrap())
         .collect()
@@ -228,7 +228,7 @@ async fn nodeless_vehicle_leaves_last_will() {
         assert!(!login("gauss", topic).await, "{topic}");
     }
     let told = async {
-        while watcher.heard_on("nodes/euclid").is_empty() {
+        while watcher.received_on("nodes/euclid").is_empty() {
             sleep(Duration::from_millis(20)).await;
         }
     };
@@ -268,13 +268,13 @@ async fn endless_names_leave_status_room() {
         assert!(events.poll().await.is_ok(), "{name}");
     }
     let told = async {
-        while watcher.heard_on("nodes/x7").is_empty() {
+        while watcher.received_on("nodes/x7").is_empty() {
             sleep(Duration::from_millis(20)).await;
         }
     };
     timeout(PATIENCE, told).await.unwrap();
     assert!(
-        watcher.heard_on("nodes/x999").is_empty(),
+        watcher.received_on("nodes/x999").is_empty(),
         "a last will beyond the room"
     );
     assert_eq!(status(7, "hello again").await.0, "Success", "its own place");

@@ -87,7 +87,7 @@ async fn missing_origin_is_reported() {
         trouble(&node, "no_origin").is_some()
     })
     .await;
-    assert!(subscriber.heard().is_empty());
+    assert!(subscriber.received().is_empty());
 
     let text = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21.0\n";
     node.slots()
@@ -126,7 +126,7 @@ async fn missing_origin_is_reported() {
             late.status("north").is_some() && late.description("north").is_some()
         })
         .await;
-        late.heard().iter().all(|heard| heard.topic.tile == tile)
+        late.received().iter().all(|heard| heard.topic.tile == tile)
     };
     until("the former tile is empty", is_left).await;
     node.stop().await;

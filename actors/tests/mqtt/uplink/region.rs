@@ -70,14 +70,14 @@ impl Broker {
 
 /// A message as the subscriber got it.
 #[derive(Debug, Clone)]
-pub(crate) struct Heard {
+pub(crate) struct ReceivedMessage {
     pub(crate) topic: RegionTopic,
     payload: Bytes,
     pub(crate) is_retained: bool,
     pub(crate) at: Timestamp,
 }
 
-impl Heard {
+impl ReceivedMessage {
     /// The payload, if the topic is of this kind.
     fn read<T: Payload>(&self, kind: RegionTopicKind) -> Option<T> {
         (self.topic.kind == kind).then(|| decode(&self.payload, &Limits::default()).unwrap())
@@ -86,7 +86,7 @@ impl Heard {
 
 /// A subscriber to all topics of the region that connects again after each break.
 pub(crate) struct Subscriber {
-    heard: Arc<Mutex<Vec<Heard>>>,
+    received: Arc<Mutex<Vec<ReceivedMessage>>>,
     client: AsyncClient,
     task: JoinHandle<()>,
 }
@@ -100,8 +100,8 @@ impl Subscriber {
         );
         options.set_keep_alive(Duration::from_secs(60));
         let (client, mut events) = AsyncClient::new(options, 64);
-        let heard = Arc::<Mutex<Vec<Heard>>>::default();
-        let list = Arc::clone(&heard);
+        let received = Arc::<Mutex<Vec<ReceivedMessage>>>::default();
+        let list = Arc::clone(&received);
         let subscriber = client.clone();
         let task = tokio::spawn(async move {
             loop {
@@ -119,13 +119,13 @@ impl Subscriber {
                             continue;
                         };
                         let at = clock::now();
-                        let heard = Heard {
+                        let received = ReceivedMessage {
                             topic,
                             payload: publish.payload,
                             is_retained: publish.retain,
                             at,
                         };
-                        list.lock().unwrap().push(heard);
+                        list.lock().unwrap().push(received);
                     }
                     Ok(_) => {}
                     Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
@@ -133,7 +133,7 @@ impl Subscriber {
             }
         });
         Self {
-            heard,
+            received,
             client,
             task,
         }
@@ -150,15 +150,15 @@ impl Subscriber {
             .unwrap();
     }
 
-    pub(crate) fn heard(&self) -> Vec<Heard> {
-        self.heard.lock().unwrap().clone()
+    pub(crate) fn received(&self) -> Vec<ReceivedMessage> {
+        self.received.lock().unwrap().clone()
     }
 
     /// Maps of a cell and when they came.
     pub(crate) fn maps(&self, cell: &str) -> Vec<(CellMap, Timestamp)> {
-        let of_cell = |heard: &Heard| heard.topic.cell.as_str() == cell;
-        let maps = self.heard().into_iter().filter(of_cell);
-        maps.filter_map(|heard| Some((heard.read(RegionTopicKind::Map)?, heard.at)))
+        let of_cell = |received: &ReceivedMessage| received.topic.cell.as_str() == cell;
+        let maps = self.received().into_iter().filter(of_cell);
+        maps.filter_map(|received| Some((received.read(RegionTopicKind::Map)?, received.at)))
             .collect()
     }
 
@@ -173,12 +173,12 @@ impl Subscriber {
     }
 
     fn last<T: Payload>(&self, cell: &str, kind: RegionTopicKind) -> Option<T> {
-        let heard = self.heard();
-        heard
+        let received = self.received();
+        received
             .iter()
             .rev()
-            .filter(|heard| heard.topic.cell.as_str() == cell)
-            .find_map(|heard| heard.read(kind))
+            .filter(|received| received.topic.cell.as_str() == cell)
+            .find_map(|received| received.read(kind))
     }
 }
 

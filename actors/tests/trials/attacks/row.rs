@@ -192,14 +192,17 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
     for (row, victim, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
         let lies = outcome.believed_lies;
-        let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
-            (false, _) => outcome.fault.as_ref().map_or_else(
+        let verdict = if !row.took_place(outcome) {
+            outcome.fault.as_ref().map_or_else(
                 || "NOT ATTACKED: too few deeds".to_owned(),
                 |fault| format!("FAILED: {fault}"),
-            ),
-            (true, true) => "held".to_owned(),
-            (true, false) if outcome.ended.is_empty() => "BROKEN".to_owned(),
-            (true, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
+            )
+        } else if row.bar.is_met(outcome) {
+            "held".to_owned()
+        } else if outcome.ended.is_empty() {
+            "BROKEN".to_owned()
+        } else {
+            format!("BROKEN, ended: {}", outcome.ended.join(", "))
         };
         let attack = row.attack;
         let means = row.means.name();

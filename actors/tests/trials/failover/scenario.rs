@@ -136,7 +136,7 @@ const BASE: Scenario = Scenario {
 pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "edge_sigkill",
-        script: &[measured(Fault::Kill(&[Who::Edge]), 2, (1, 1))],
+        script: &[measured(Fault::Kill(&[Who::Edge]), 2, 1, 1)],
         gap: GapBar::Killed,
         ..BASE
     },
@@ -144,8 +144,8 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
         name: "edge_sigkill_door_flood",
         least_nodes: 3,
         script: &[
-            step(Fault::FloodStandby, 3, (0, 0)),
-            measured(Fault::Kill(&[Who::Edge]), 3, (1, 1)),
+            step(Fault::FloodStandby, 3, 0, 0),
+            measured(Fault::Kill(&[Who::Edge]), 3, 1, 1),
         ],
         gap: GapBar::Killed,
         ..BASE
@@ -153,8 +153,8 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "edge_sigstop_sigcont",
         script: &[
-            measured(Fault::PauseEdge, 3, (1, 1)),
-            step(Fault::ResumeEdge, 9, (1, 2)),
+            measured(Fault::PauseEdge, 3, 1, 1),
+            step(Fault::ResumeEdge, 9, 1, 2),
         ],
         gap: GapBar::Silent,
         ..BASE
@@ -162,7 +162,7 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "edge_and_standby_sigkill",
         least_nodes: 3,
-        script: &[measured(Fault::Kill(&[Who::Standby, Who::Edge]), 2, (1, 1))],
+        script: &[measured(Fault::Kill(&[Who::Standby, Who::Edge]), 2, 1, 1)],
         gap: GapBar::Killed,
         ..BASE
     },
@@ -170,22 +170,22 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
         name: "leader_cav_sigkill",
         least_nodes: 3,
         edge: false,
-        script: &[measured(Fault::Kill(&[Who::Leader]), 2, (1, 1))],
+        script: &[measured(Fault::Kill(&[Who::Leader]), 2, 1, 1)],
         gap: GapBar::Killed,
         ..BASE
     },
     Scenario {
         name: "edge_restart",
         script: &[
-            step(Fault::Kill(&[Who::Edge]), 2, (1, 1)),
-            measured(Fault::RestartEdge, 8, (1, 1)),
+            step(Fault::Kill(&[Who::Edge]), 2, 1, 1),
+            measured(Fault::RestartEdge, 8, 1, 1),
         ],
         seamless: true,
         ..BASE
     },
     Scenario {
         name: "edge_sigkill_after_votes",
-        script: &[measured(Fault::Kill(&[Who::Edge]), 4, (1, 1))],
+        script: &[measured(Fault::Kill(&[Who::Edge]), 4, 1, 1)],
         gap: GapBar::Killed,
         votes: true,
         ..BASE
@@ -193,28 +193,28 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "external_broker_sigkill",
         needs: Needs::MosquittoAndFallback,
-        script: &[measured(Fault::KillExternalBroker, 4, (0, 1))],
+        script: &[measured(Fault::KillExternalBroker, 4, 0, 1)],
         gap: GapBar::Killed,
         ..BASE
     },
     Scenario {
         name: "edge_sigkill_external_broker",
         needs: Needs::Mosquitto,
-        script: &[measured(Fault::Kill(&[Who::Edge]), 2, (1, 1))],
+        script: &[measured(Fault::Kill(&[Who::Edge]), 2, 1, 1)],
         gap: GapBar::Killed,
         ..BASE
     },
     Scenario {
         name: "six_busy_loops",
-        script: &[measured(Fault::Busy(6), 10, (0, 0))],
+        script: &[measured(Fault::Busy(6), 10, 0, 0)],
         ..BASE
     },
     Scenario {
         name: "split_and_heal",
         needs: Needs::Namespaces,
         script: &[
-            measured(Fault::Split, 4, (1, 1)),
-            step(Fault::Heal(Cure::Split), 10, (0, 2)),
+            measured(Fault::Split, 4, 1, 1),
+            step(Fault::Heal(Cure::Split), 10, 0, 2),
         ],
         gap: GapBar::Silent,
         ..BASE
@@ -224,8 +224,8 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
         needs: Needs::Namespaces,
         least_nodes: 3,
         script: &[
-            measured(Fault::CutOneWay, 6, (0, 2)),
-            step(Fault::Heal(Cure::OneWay), 10, (0, 2)),
+            measured(Fault::CutOneWay, 6, 0, 2),
+            step(Fault::Heal(Cure::OneWay), 10, 0, 2),
         ],
         gap: GapBar::Silent,
         ..BASE
@@ -233,7 +233,7 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
     Scenario {
         name: "edge_new_address",
         needs: Needs::Namespaces,
-        script: &[measured(Fault::Readdress(Who::Edge), 8, (0, 2))],
+        script: &[measured(Fault::Readdress(Who::Edge), 8, 0, 2)],
         gap: GapBar::Silent,
         ..BASE
     },
@@ -241,7 +241,7 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
         name: "standby_new_address",
         needs: Needs::Namespaces,
         least_nodes: 3,
-        script: &[measured(Fault::Readdress(Who::Standby), 8, (0, 0))],
+        script: &[measured(Fault::Readdress(Who::Standby), 8, 0, 0)],
         gap: GapBar::Silent,
         ..BASE
     },
@@ -249,25 +249,25 @@ pub(crate) const SCENARIOS: [Scenario; 15] = [
         name: "loss_20_percent",
         needs: Needs::PacketFilter,
         script: &[
-            measured(Fault::Lose(20), 10, (0, 0)),
-            step(Fault::Heal(Cure::Loss), 4, (0, 0)),
+            measured(Fault::Lose(20), 10, 0, 0),
+            step(Fault::Heal(Cure::Loss), 4, 0, 0),
         ],
         ..BASE
     },
 ];
 
-const fn step(fault: Fault, seconds: u64, changes: (usize, usize)) -> Step {
+const fn step(fault: Fault, seconds: u64, least_changes: usize, most_changes: usize) -> Step {
     Step {
         fault,
         watch: Duration::from_secs(seconds),
-        changes,
+        changes: (least_changes, most_changes),
         measured: false,
     }
 }
 
-const fn measured(fault: Fault, seconds: u64, changes: (usize, usize)) -> Step {
+const fn measured(fault: Fault, seconds: u64, least_changes: usize, most_changes: usize) -> Step {
     Step {
         measured: true,
-        ..step(fault, seconds, changes)
+        ..step(fault, seconds, least_changes, most_changes)
     }
 }

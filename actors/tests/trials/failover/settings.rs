@@ -73,9 +73,12 @@ pub(crate) fn configuration(
     } else {
         seeds.join(", ")
     };
-    let listening = |address: SocketAddr| match plan.bridged {
-        true => SocketAddr::from((Ipv4Addr::UNSPECIFIED, address.port())),
-        false => address,
+    let listening = |address: SocketAddr| {
+        if plan.bridged {
+            SocketAddr::from((Ipv4Addr::UNSPECIFIED, address.port()))
+        } else {
+            address
+        }
     };
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\

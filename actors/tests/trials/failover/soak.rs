@@ -148,7 +148,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         };
         println!(
             "minute {number} of {minutes}: {disturbance}; {}",
-            tell(&minute)
+            summary_of(&minute)
         );
         past.push(minute);
     }
@@ -156,7 +156,8 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     let mut runs = cell.runs()?;
     let forged_accepted = take_out_forged(&mut runs);
     for minute in &mut past {
-        minute.longest_gap_ms = longest_gap(&runs, minute.span).as_millis() as u64;
+        let (from, until) = minute.span;
+        minute.longest_gap_ms = longest_gap(&runs, from, until).as_millis() as u64;
     }
     let growing = series
         .iter()
@@ -200,7 +201,7 @@ fn take_out_forged(runs: &mut [NodeRun]) -> usize {
 }
 
 /// The longest wait of any process that took maps before and after the span.
-fn longest_gap(runs: &[NodeRun], (from, until): (Timestamp, Timestamp)) -> Duration {
+fn longest_gap(runs: &[NodeRun], from: Timestamp, until: Timestamp) -> Duration {
     let throughout = |run: &&NodeRun| {
         let first_and_last = run.accepted.first().zip(run.accepted.last());
         first_and_last
@@ -213,7 +214,7 @@ fn longest_gap(runs: &[NodeRun], (from, until): (Timestamp, Timestamp)) -> Durat
     waits.max().unwrap_or_default()
 }
 
-fn tell(minute: &Minute) -> String {
+fn summary_of(minute: &Minute) -> String {
     let recovered = match minute.recovered_after_ms {
         Some(ms) => format!("all well {:.1} s later", ms as f64 / 1000.0),
         None => "NOT RECOVERED".to_owned(),

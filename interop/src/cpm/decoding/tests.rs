@@ -20,7 +20,26 @@ const ORIGIN: GeographicOrigin = GeographicOrigin {
 };
 
 /// Semi-axes of 1.22 m, about half a metre of standard deviation, and no direction.
-const HALF_METRE: (u16, u16, u16) = (122, 122, 3601);
+const HALF_METRE: Ellipse = Ellipse {
+    major: 122,
+    minor: 122,
+    direction: 3601,
+};
+
+/// Confidence ellipse of a reference position, in the units of a CPM.
+#[derive(Debug, Clone, Copy)]
+struct Ellipse {
+    major: u16,
+    minor: u16,
+    direction: u16,
+}
+
+/// Number of a segment, from 1, and of all segments.
+#[derive(Debug, Clone, Copy)]
+struct SegmentNumber {
+    this: u8,
+    total: u8,
+}
 
 fn coordinate(value: i32, confidence: u16) -> cdd::CartesianCoordinateWithConfidence {
     cdd::CartesianCoordinateWithConfidence {
@@ -76,8 +95,8 @@ fn at(x: i32, y: i32) -> cdd::PerceivedObject {
 
 fn message(
     objects: Vec<cdd::PerceivedObject>,
-    error: (u16, u16, u16),
-    segment: Option<(u8, u8)>,
+    error: Ellipse,
+    segment: Option<SegmentNumber>,
     time: u64,
 ) -> Vec<u8> {
     message_of(vec![objects], error, segment, time)
@@ -86,24 +105,24 @@ fn message(
 /// A message with these containers of objects.
 fn message_of(
     containers: Vec<Vec<cdd::PerceivedObject>>,
-    (major, minor, direction): (u16, u16, u16),
-    segment: Option<(u8, u8)>,
+    error: Ellipse,
+    segment: Option<SegmentNumber>,
     time: u64,
 ) -> Vec<u8> {
     let position = cdd::ReferencePosition {
         latitude: cdd::Latitude(522_296_756),
         longitude: cdd::Longitude(210_122_287),
         position_confidence_ellipse: cdd::PosConfidenceEllipse {
-            semi_major_confidence: cdd::SemiAxisLength(major),
-            semi_minor_confidence: cdd::SemiAxisLength(minor),
-            semi_major_orientation: cdd::HeadingValue(direction),
+            semi_major_confidence: cdd::SemiAxisLength(error.major),
+            semi_minor_confidence: cdd::SemiAxisLength(error.minor),
+            semi_major_orientation: cdd::HeadingValue(error.direction),
         },
         altitude: cdd::Altitude {
             altitude_value: cdd::AltitudeValue(800_001),
             altitude_confidence: cdd::AltitudeConfidence::unavailable,
         },
     };
-    let segment = segment.map(|(this, total)| {
+    let segment = segment.map(|SegmentNumber { this, total }| {
         cdd::MessageSegmentationInfo::new(cdd::CardinalNumber3b(total), cdd::OrdinalNumber3b(this))
     });
     let management =
@@ -317,41 +336,52 @@ fn unavailable_confidence_widens_covariance() {
 
 #[test]
 fn reference_error_adds_to_object_error() {
-    let covariance = |ellipse| {
+    let covariance = |major, minor, direction| {
+        let ellipse = Ellipse {
+            major,
+            minor,
+            direction,
+        };
         let received = decode(&message(vec![object()], ellipse, None, TIME), &ORIGIN).unwrap();
         received.objects[0].covariance_m2.unwrap()
     };
     // Standard deviations of 1.6342 m and 0.8171 m, to the north-east, then to the east.
-    let [along, across] = [(4.0_f64 / 2.4477).powi(2), (2.0_f64 / 2.4477).powi(2)];
+    let along = (4.0_f64 / 2.4477).powi(2);
+    let across = (2.0_f64 / 2.4477).powi(2);
     let mean = (along + across) / 2.0;
     let half = (along - across) / 2.0;
     assert_near(
-        covariance((400, 200, 450)),
+        covariance(400, 200, 450),
         [1.0 + mean, half, 0.25 + mean],
         1e-6,
     );
     assert_near(
-        covariance((400, 200, 900)),
+        covariance(400, 200, 900),
         [1.0 + along, 0.0, 0.25 + across],
         1e-6,
     );
     assert_near(
-        covariance((400, 200, 3601)),
+        covariance(400, 200, 3601),
         [1.0 + along, 0.0, 0.25 + along],
         1e-6,
     );
     let usual = (5.0_f64 / 2.4477).powi(2);
     assert_near(
-        covariance((4095, 200, 900)),
+        covariance(4095, 200, 900),
         [1.0 + usual, 0.0, 0.25 + usual],
         1e-6,
     );
     assert_near(
-        covariance((4095, 4095, 3601)),
+        covariance(4095, 4095, 3601),
         [1.0 + usual, 0.0, 0.25 + usual],
         1e-6,
     );
-    let wide = message(vec![object()], (4094, 4094, 3601), None, TIME);
+    let ellipse = Ellipse {
+        major: 4094,
+        minor: 4094,
+        direction: 3601,
+    };
+    let wide = message(vec![object()], ellipse, None, TIME);
     assert_eq!(decode(&wide, &ORIGIN), Err(CpmError::NoPosition));
 }
 
@@ -449,7 +479,7 @@ fn incomplete_segments_are_dropped() {
             &message(
                 vec![at(x, 0), at(131_071, 0)],
                 HALF_METRE,
-                Some((this, 2)),
+                Some(SegmentNumber { this, total: 2 }),
                 time,
             ),
             &ORIGIN,
@@ -484,7 +514,12 @@ fn oversized_segments_are_dropped() {
     let objects = |number: usize| vec![at(100, 0); number];
     let segment = |this, number| {
         decode(
-            &message(objects(number), HALF_METRE, Some((this, 8)), TIME),
+            &message(
+                objects(number),
+                HALF_METRE,
+                Some(SegmentNumber { this, total: 8 }),
+                TIME,
+            ),
             &ORIGIN,
         )
         .unwrap()

@@ -156,7 +156,7 @@ fn result(
             "--reports and --config are for a truth of locations"
         )));
     }
-    if let Some((said, truth)) = evaluation.labels_that_never_meet() {
+    if let Some((said, truth)) = evaluation.labels_without_match() {
         eprintln!(
             "no object of {} has a class of {}: {said} there, {truth} in the truth; classes count by their exact names",
             input.display(),

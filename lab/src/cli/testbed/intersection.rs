@@ -59,9 +59,9 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     }
     print(&table(&results))?;
     if let Some(file) = &arguments.reports {
-        let lines = intersection::reports(&recording);
+        let reports = intersection::reports(&recording);
         let of_votes = |report| intersection::line(report, ReportKind::VoteDetections);
-        let lines = lines.iter().map(of_votes).collect::<Result<Vec<_>, _>>();
+        let lines = reports.iter().map(of_votes).collect::<Result<Vec<_>, _>>();
         let text = lines.context("reports are plain json")?.join("\n") + "\n";
         fs::write(file, text).with_context(|| format!("cannot write {}", file.display()))?;
     }

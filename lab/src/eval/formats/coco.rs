@@ -155,7 +155,7 @@ fn object(
     } = *annotation;
     let frame = frame_number(image_id)
         .ok_or_else(|| ("image_id", format!("{image_id} is out of bounds")))?;
-    let label = match categories {
+    let named = match categories {
         Some(categories) => categories.get(&category_id).cloned(),
         None => usize::try_from(category_id)
             .ok()
@@ -163,7 +163,7 @@ fn object(
             .map(Label::new_static),
     };
     let unknown = || ("category_id", format!("{category_id} is no known category"));
-    let label = label.ok_or_else(unknown)?;
+    let label = named.ok_or_else(unknown)?;
     let image = BoundingBox {
         x_min,
         y_min,

@@ -27,7 +27,7 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
     };
     if cells.has_commas {
         let number = cells.integer(2, "type")?;
-        let label = usize::try_from(number - 1)
+        let class = usize::try_from(number - 1)
             .ok()
             .and_then(|place| CLASSES.get(place));
         let unknown = || {
@@ -37,7 +37,7 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
                 format!("{number} is none of 1 to {}", CLASSES.len()),
             )
         };
-        let label = Label::new_static(label.ok_or_else(unknown)?);
+        let label = Label::new_static(class.ok_or_else(unknown)?);
         let score = cells.number(7, "score")?;
         return Ok(Some((
             frame,

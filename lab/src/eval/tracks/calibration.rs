@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::matching::{best, near_pairs};
-use super::{SaidObject, ScoredFrame, ZERO_DISTANCE_M};
+use super::{ReportedObject, ScoredFrame, ZERO_DISTANCE_M};
 use crate::eval::reliability::{JudgedStatement, Reliability};
 
 /// The distance in metres within which a `confidence` places the object.
@@ -37,7 +37,7 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> ReliabilityBins {
 fn reliability(
     frames: &[ScoredFrame],
     limit_m: f64,
-    stated: impl Fn(&SaidObject) -> Option<f64>,
+    stated: impl Fn(&ReportedObject) -> Option<f64>,
 ) -> Reliability {
     let mut statements = Vec::new();
     for frame in frames {

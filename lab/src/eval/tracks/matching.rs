@@ -2,7 +2,7 @@
 
 use ecod::association::{Candidate, assign};
 
-use super::{SaidObject, ScoredFrame, TrueObject};
+use super::{ReportedObject, ScoredFrame, TrueObject};
 
 /// A true and a reported object, by their places in a frame or in a table of identities.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,7 +14,7 @@ pub(super) struct MatchedPair {
 }
 
 /// Distance in metres if the two may match.
-pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) -> Option<f64> {
+pub(super) fn distance_m(truth: &TrueObject, said: &ReportedObject, limit_m: f64) -> Option<f64> {
     let distance_m = (truth.position - said.position).norm();
     (distance_m <= limit_m && truth.label == said.label).then_some(distance_m)
 }

@@ -14,8 +14,8 @@ fn truth(id: u32, x: f64) -> TrueObject {
     }
 }
 
-fn said(id: u32, x: f64, score: f64) -> SaidObject {
-    SaidObject {
+fn said(id: u32, x: f64, score: f64) -> ReportedObject {
+    ReportedObject {
         id,
         label: "car".into(),
         score,
@@ -318,15 +318,15 @@ fn unmatched_classes_are_listed() {
     let text = r#"{"frames": [{"t_us": 100, "objects": [{"id": 1, "label": "car", "x_m": 1, "y_m": 2}]}]}"#;
     let with = |labels: &[&str]| {
         let mut evaluation = TrackEvaluation::new(TrackTruth::parse(text).unwrap());
-        let objects: Vec<SaidObject> = labels
+        let objects: Vec<ReportedObject> = labels
             .iter()
-            .map(|label| SaidObject {
+            .map(|label| ReportedObject {
                 label: Label::new(label),
                 ..said(0, 1.0, 0.9)
             })
             .collect();
-        evaluation.said(Timestamp(100), &objects);
-        evaluation.labels_that_never_meet()
+        evaluation.add_objects(Timestamp(100), &objects);
+        evaluation.labels_without_match()
     };
     assert_eq!(with(&["person", "car"]), None);
     assert_eq!(with(&[]), None);

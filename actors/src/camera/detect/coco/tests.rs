@@ -34,7 +34,7 @@ fn best(detections: &[Detection]) -> &Detection {
 }
 
 #[test]
-fn photographs_show_what_they_show() {
+fn objects_in_photographs_are_detected() {
     let mut detector = CocoDetector::new(CocoConfig::default()).unwrap();
     for (name, label, least, middle) in [
         ("coffee", "cup", 0.9, (310.0, 190.0)),
@@ -175,7 +175,7 @@ fn detector_survives_unusable_image() {
 }
 
 #[test]
-fn the_numbering_is_coco_s() {
+fn classes_have_coco_numbers() {
     let name = |id| {
         labels::all()
             .find(|(class, _)| *class == id)

@@ -111,7 +111,7 @@ pub(super) enum NoHead {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clues<'a> {
     /// The configured family.
-    pub(super) told: Option<Family>,
+    pub(super) configured: Option<Family>,
     /// The configured number of the first class.
     pub(super) first_class: Option<u8>,
     /// The exporter's name of the model.
@@ -129,7 +129,11 @@ impl Head {
     pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Result<Self, NoHead> {
         let (family, layout) = by_names(clues, outputs)
             .or_else(|| by_shape(clues, outputs))
-            .filter(|(family, _)| clues.told.is_none_or(|told| told == *family))
+            .filter(|(family, _)| {
+                clues
+                    .configured
+                    .is_none_or(|configured| configured == *family)
+            })
             .ok_or(NoHead::UnknownOutputs)?;
         let is_tensorflow = outputs
             .iter()
@@ -306,7 +310,7 @@ fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
     let is_table = |at: &usize| matches!(outputs[*at].shape[..], [_, rows, _] if rows == count);
     if let Some(logits) = find(&["logits"], 3..=3).filter(is_table) {
         let is_detr = count == DETR_QUERIES || outputs[logits].shape[2] == DETR_COCO_LOGITS;
-        let found = clues.told.unwrap_or(if is_detr {
+        let found = clues.configured.unwrap_or(if is_detr {
             Family::Detr
         } else {
             Family::Rtdetr
@@ -353,7 +357,7 @@ fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
         .sum();
     let grids = [fine, fine + cells(clues.input, COARSE_STRIDE)];
     let description = clues.description.to_ascii_lowercase().replace('-', "");
-    match clues.told {
+    match clues.configured {
         Some(Family::Rtdetr) => rtdetr(columns),
         None if description.contains("rtdetr") => rtdetr(columns),
         Some(Family::Yolov5) if columns > 5 => Some((Family::Yolov5, Layout::Objectness(0))),

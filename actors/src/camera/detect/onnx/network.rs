@@ -91,23 +91,24 @@ impl Network {
                 .map(|(width, height)| ImageSize { width, height }),
             configured,
         ) {
-            (Some(taken), Some(told)) if taken != told => {
+            (Some(taken), Some(configured)) if taken != configured => {
                 return Err(OnnxError::OtherSize {
                     path: path.to_owned(),
                     taken,
-                    told,
+                    configured,
                 });
             }
-            (taken, told) => {
+            (taken, configured) => {
                 let said = || {
                     stated_size(&model).ok_or_else(|| OnnxError::AnySize {
                         path: path.to_owned(),
                     })
                 };
-                taken.or(told).map_or_else(said, Ok)?
+                taken.or(configured).map_or_else(said, Ok)?
             }
         };
-        let [height, width] = [size.height as usize, size.width as usize];
+        let height = size.height as usize;
+        let width = size.width as usize;
         let image_shape = if has_channels_last {
             [height, width, 3]
         } else {

@@ -144,8 +144,12 @@ impl StampPacer {
     /// a restart, the frame is one period later.
     fn schedule(&mut self, stamp_ms: f64) {
         let step_ms = stamp_ms - self.stamp_ms;
-        let step = Duration::try_from_secs_f64(step_ms / 1e3).unwrap_or_default();
-        let step = if step.is_zero() { self.period } else { step };
+        let stated_step = Duration::try_from_secs_f64(step_ms / 1e3).unwrap_or_default();
+        let step = if stated_step.is_zero() {
+            self.period
+        } else {
+            stated_step
+        };
         self.stamp_ms = stamp_ms;
         let now = Instant::now();
         self.due = Some(self.due.map_or(now, |due| (due + step).max(now)));
@@ -335,12 +339,12 @@ impl Video {
 
     /// The next image, if there is one.
     fn read(&mut self) -> Result<Option<Mat>, FrameError> {
-        let mut image = Mat::default();
-        let read = self.capture.read(&mut image).map_err(|e| self.lost(e))?;
-        if !read || image.empty() {
+        let mut decoded = Mat::default();
+        let read = self.capture.read(&mut decoded).map_err(|e| self.lost(e))?;
+        if !read || decoded.empty() {
             return Ok(None);
         }
-        let image = self.presentation.apply(image);
+        let image = self.presentation.apply(decoded);
         image.map(Some).map_err(|e| self.lost(e))
     }
 
@@ -372,12 +376,12 @@ impl FrameSource for Video {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         let waiting = self.playback.as_mut().and_then(|p| p.next.take());
         let is_waiting = waiting.is_some();
-        let image = match waiting {
+        let next = match waiting {
             Some(image) => Some(image),
             None => self.read_file()?,
         };
         let origin = || self.origin.clone();
-        let image = image.ok_or_else(|| match self.playback {
+        let image = next.ok_or_else(|| match self.playback {
             Some(_) => FrameError::Ended { origin: origin() },
             None => FrameError::Lost {
                 origin: origin(),

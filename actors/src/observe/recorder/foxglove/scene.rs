@@ -256,17 +256,17 @@ impl SceneStyle {
                 a: FUSED_COLOR.a * existence,
                 ..FUSED_COLOR
             };
-            let entity = SceneEntity::new(map.fused_at_us, format!("object/{}", object.id));
-            let (entity, height_m) = match object.size_m {
-                Some(size_m) => (entity.block(pose, size_m, color), MAX_HEIGHT_M),
-                None => (entity.ball(pose, self.object_m, color), 0.0),
+            let bare = SceneEntity::new(map.fused_at_us, format!("object/{}", object.id));
+            let (shaped, height_m) = match object.size_m {
+                Some(size_m) => (bare.block(pose, size_m, color), MAX_HEIGHT_M),
+                None => (bare.ball(pose, self.object_m, color), 0.0),
             };
             let is_likely = object.confidence >= LIKELY;
             let position = [object.x_m, object.y_m];
             let entity = if is_likely {
-                entity.ellipse(position, &object.covariance(), color)
+                shaped.ellipse(position, &object.covariance(), color)
             } else {
-                entity
+                shaped
             };
             entity
                 .text(

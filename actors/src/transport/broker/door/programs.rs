@@ -125,7 +125,7 @@ impl Door {
         };
         self.0
             .as_deref()
-            .is_some_and(|door| is_of_nodeless(door) || door.may_say(principal, topic).is_ok())
+            .is_some_and(|door| is_of_nodeless(door) || door.may_publish(principal, topic).is_ok())
     }
 
     /// Processes a program's message.
@@ -142,7 +142,7 @@ impl Door {
         match place {
             TopicPlace::Cell if publish.retain => door.on_nodeless_message(topic, &publish.payload),
             TopicPlace::Cell => Ok(()),
-            TopicPlace::Door => door.may_say(principal, topic),
+            TopicPlace::Door => door.may_publish(principal, topic),
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
                 Some(Topic::Cell) => door.on_description(principal, &publish.payload),
                 Some(Topic::Nodes(name)) => door.on_dismissal(principal, name),
@@ -282,7 +282,7 @@ impl DoorState {
 
     /// Checks that a program may publish on a topic for other messages than reports and requests:
     /// its own parts' status, its CPMs and, without certificates, topics of other applications.
-    fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), DoorRefusal> {
+    fn may_publish(&self, principal: &Principal, topic: &str) -> Result<(), DoorRefusal> {
         let node = &self.setup.node;
         match self.setup.topics.parse(topic) {
             Some(Topic::Nodes(name))
@@ -326,8 +326,8 @@ impl DoorState {
         self.check_rate(kind, now)?;
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
-            let told = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
-            let text = format!("the report on {topic} is not usable: {reason}{told}; see docs/protocol.md#rejections");
+            let detail = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
+            let text = format!("the report on {topic} is not usable: {reason}{detail}; see docs/protocol.md#rejections");
             DoorRefusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
@@ -433,7 +433,7 @@ impl DoorState {
             return true;
         }
         if parts.len() >= MAX_PARTS && !parts.contains_key(name) {
-            parts.retain(|_, heard| now.since(*heard) < PART_RETENTION);
+            parts.retain(|_, at| now.since(*at) < PART_RETENTION);
         }
         let has_room = parts.len() < MAX_PARTS || parts.contains_key(name);
         if has_room {

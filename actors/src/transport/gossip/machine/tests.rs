@@ -171,10 +171,10 @@ impl Cell {
                         sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
                     }
                     GossipOutput::Multicast { .. } | GossipOutput::Renewal { .. } => (),
-                    GossipOutput::Tell(MembershipEvent::Troubled { about, kind, .. }) => {
+                    GossipOutput::Event(MembershipEvent::Troubled { about, kind, .. }) => {
                         node.troubles.insert((about, kind));
                     }
-                    GossipOutput::Tell(event) => node.events.push(event),
+                    GossipOutput::Event(event) => node.events.push(event),
                 }
             }
         }
@@ -211,7 +211,7 @@ impl Cell {
         }
     }
 
-    fn forget_events(&mut self) {
+    fn clear_events(&mut self) {
         self.nodes.values_mut().for_each(|node| node.events.clear());
     }
 
@@ -240,7 +240,7 @@ fn index(address: SocketAddr) -> usize {
 }
 
 #[test]
-fn nodes_meet_by_multicast() {
+fn nodes_join_by_multicast() {
     let cell = Cell::of(8);
     cell.assert_complete();
     let member = &cell.nodes[&1].machine.members()[0];
@@ -252,7 +252,7 @@ fn nodes_meet_by_multicast() {
 
 /// A node gets another address while it goes on sending. Others reach it there at once and keep it as a member.
 fn a_node_moves(mut cell: Cell) {
-    cell.forget_events();
+    cell.clear_events();
     let moving = cell.nodes.remove(&2).unwrap();
     cell.nodes.insert(12, moving);
     // Its next datagrams come from there already, before it has noticed.
@@ -293,7 +293,7 @@ fn moved_node_is_reached_at_once() {
 }
 
 #[test]
-fn nodes_meet_by_one_seed() {
+fn nodes_join_by_one_seed() {
     let mut cell = Cell::new(false);
     for node in 2..=5 {
         cell.start(node, &name(node));
@@ -346,7 +346,7 @@ fn cell_forms_despite_loss() {
 #[test]
 fn only_dead_node_goes_down() {
     let mut cell = Cell::of(8);
-    cell.forget_events();
+    cell.clear_events();
     cell.nodes.remove(&3);
     cell.run(1500);
     cell.assert_complete();
@@ -388,7 +388,7 @@ fn stopped_node_rejoins() {
     cell.nodes.get_mut(&4).unwrap().stopped = true;
     cell.run(5000);
     assert!(!cell.sees(1).contains("node-4"));
-    cell.forget_events();
+    cell.clear_events();
     cell.nodes.get_mut(&4).unwrap().stopped = false;
     cell.run(2000);
     cell.assert_complete();
@@ -432,7 +432,7 @@ fn quick_restart_is_no_death() {
     }
     cell.run(5000);
     cell.assert_complete();
-    cell.forget_events();
+    cell.clear_events();
     cell.start(5, "node-5");
     cell.nodes
         .get_mut(&5)
@@ -452,7 +452,7 @@ fn quick_restart_is_no_death() {
 #[test]
 fn second_namesake_gives_up() {
     let mut cell = Cell::of(4);
-    cell.forget_events();
+    cell.clear_events();
     cell.start(9, "node-2");
     let sent = cell.sent;
     cell.run(8000);
@@ -590,7 +590,7 @@ fn moved_node_regains_its_name() {
 #[test]
 fn datagrams_arrive_with_their_sender() {
     let mut cell = Cell::of(3);
-    cell.forget_events();
+    cell.clear_events();
     let now = cell.now;
     let sender = &mut cell.nodes.get_mut(&1).unwrap().machine;
     sender.send(&node_name(3), &[42; 1200], now);
@@ -611,7 +611,7 @@ fn datagrams_arrive_with_their_sender() {
 fn lossy_link_keeps_nodes_connected() {
     let mut cell = Cell::of(2);
     cell.loss_percent = 20;
-    cell.forget_events();
+    cell.clear_events();
     for _ in 0..1200 {
         for (from, to) in [(1, 2), (2, 1)] {
             let now = cell.now;

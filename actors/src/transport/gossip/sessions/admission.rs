@@ -90,7 +90,7 @@ impl Sessions {
                     Some(KnownMember {
                         life, alive: false, ..
                     }) => NameClaim::After(life),
-                    Some(_) if self.is_heard_elsewhere(head, &name, arrival.from) => {
+                    Some(_) if self.has_other_address(head, &name, arrival.from) => {
                         NameClaim::Taken
                     }
                     _ => NameClaim::Free,
@@ -152,7 +152,7 @@ impl Sessions {
                             answer,
                         });
                     }
-                    return Ok(FrameContent::Met {
+                    return Ok(FrameContent::Introduced {
                         introduction,
                         answer,
                         speaks: claim != NameClaim::Taken,
@@ -180,7 +180,7 @@ impl Sessions {
                     });
                 }
                 let claim = self.admit(head, &introduction.id, admission, arrival)?;
-                Ok(FrameContent::Met {
+                Ok(FrameContent::Introduced {
                     introduction,
                     answer: None,
                     speaks: claim != NameClaim::Taken,
@@ -329,7 +329,7 @@ impl Sessions {
         let has_moved = self.has_moved(head, arrival);
         let claim = self.admit(head, &introduction.id, admission, arrival)?;
         let answer = self.write_handshake(&own_head, &head.sender, &accept, &own_attestation);
-        Ok(FrameContent::Met {
+        Ok(FrameContent::Introduced {
             introduction,
             answer: Some(answer),
             speaks: claim != NameClaim::Taken,
@@ -418,7 +418,7 @@ impl Sessions {
     }
 
     /// True if another session at another address is accepted for a name.
-    fn is_heard_elsewhere(&self, head: &FrameHeader, name: &NodeName, from: SocketAddr) -> bool {
+    fn has_other_address(&self, head: &FrameHeader, name: &NodeName, from: SocketAddr) -> bool {
         self.peers
             .speaker_id(name)
             .is_some_and(|speaker| speaker != head.sender)
@@ -473,8 +473,8 @@ impl Sessions {
                 keys: KeyRing::new(keys),
                 frames: PeerSession::frames(now),
                 proof_counter: if is_proof { head.counter } else { 0 },
-                heard: now,
-                unheard_since: None,
+                received_at: now,
+                unanswered_since: None,
                 superseded: None,
             };
             self.peers.insert(head.sender, peer)?;
@@ -484,7 +484,7 @@ impl Sessions {
             &mut self.proofs,
             &mut self.verifications,
         ] {
-            throttle.know(address, now);
+            throttle.admit(address, now);
         }
         self.peers
             .settle(head.sender, &id.name, claim != NameClaim::Taken, now);

@@ -7,7 +7,7 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
-use super::{HEARD_TIME, SESSION_IDLE_TIMEOUT};
+use super::{RECENT_TIME, SESSION_IDLE_TIMEOUT};
 use crate::platform::throttle::TokenBucket;
 use crate::transport::gossip::counters::FrameEvent;
 use crate::transport::gossip::frame::FrameHeader;
@@ -35,9 +35,9 @@ pub(super) struct PeerSession {
     pub(super) frames: TokenBucket,
     /// Counter of the frame with its last proof: no earlier one is accepted.
     pub(super) proof_counter: u64,
-    pub(super) heard: Timestamp,
+    pub(super) received_at: Timestamp,
     /// Time of the first frame sent to the node after its last frame was received.
-    pub(super) unheard_since: Option<Timestamp>,
+    pub(super) unanswered_since: Option<Timestamp>,
     /// Time since which another session is accepted for the name.
     pub(super) superseded: Option<Timestamp>,
 }
@@ -60,8 +60,8 @@ impl PeerSession {
     }
 
     pub(super) fn record_received(&mut self, now: Timestamp) {
-        self.heard = now;
-        self.unheard_since = None;
+        self.received_at = now;
+        self.unanswered_since = None;
     }
 }
 
@@ -115,7 +115,7 @@ impl PeerTable {
         let Some(peer) = self.peers.get_mut(&head.sender) else {
             return Ok(());
         };
-        let is_taken_over = peer.address != from && now.since(peer.heard) < HEARD_TIME;
+        let is_taken_over = peer.address != from && now.since(peer.received_at) < RECENT_TIME;
         if is_taken_over && stated != Some(from) {
             return Err(FrameEvent::Replayed);
         }
@@ -140,11 +140,11 @@ impl PeerTable {
         if let Some(own) = holder(&peer) {
             let is_own = |peer: &PeerSession| holder(peer).as_ref() == Some(&own);
             if self.peers.values().filter(|peer| is_own(peer)).count() >= MAX_SESSIONS_EACH {
-                self.make_room(peer.heard, is_own)?;
+                self.make_room(peer.received_at, is_own)?;
             }
         }
         if self.peers.len() >= self.max_peers {
-            self.make_room(peer.heard, |_| true)?;
+            self.make_room(peer.received_at, |_| true)?;
         }
         self.peers.insert(session, peer);
         Ok(())
@@ -157,8 +157,9 @@ impl PeerTable {
         may_go: impl Fn(&PeerSession) -> bool,
     ) -> Result<(), FrameEvent> {
         let some = self.peers.iter().filter(|(_, peer)| may_go(peer));
-        let longest_idle = some.min_by_key(|(_, peer)| peer.heard);
-        let idle = longest_idle.filter(|(_, idle)| now.since(idle.heard) >= SESSION_IDLE_TIMEOUT);
+        let longest_idle = some.min_by_key(|(_, peer)| peer.received_at);
+        let idle =
+            longest_idle.filter(|(_, idle)| now.since(idle.received_at) >= SESSION_IDLE_TIMEOUT);
         let session = idle
             .map(|(session, _)| *session)
             .ok_or(FrameEvent::TooManyPeers)?;

@@ -115,7 +115,7 @@ fn answer(opened: Result<FrameContent, FrameEvent>) -> Vec<u8> {
     match opened {
         Ok(
             FrameContent::Answer(frame)
-            | FrameContent::Met {
+            | FrameContent::Introduced {
                 answer: Some(frame),
                 ..
             },
@@ -132,7 +132,7 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
     let accept = answer(b.open(&proof, a.address, NOW));
     assert!(matches!(
         a.open(&accept, b.address, NOW),
-        Ok(FrameContent::Met {
+        Ok(FrameContent::Introduced {
             answer: None,
             speaks: true,
             ..
@@ -232,7 +232,10 @@ fn live_session_resists_takeover() {
     );
     let later = NOW + Duration::from_secs(1);
     assert!(
-        matches!(take_over(&mut b, later), Ok(FrameContent::Met { .. })),
+        matches!(
+            take_over(&mut b, later),
+            Ok(FrameContent::Introduced { .. })
+        ),
         "a node that has moved is met again"
     );
 }

@@ -117,16 +117,19 @@ impl Issuer {
             .collect();
         // With other CAs' lists, the status of this CA's certificates would be unknown.
         let lists = if own.is_empty() { lists.to_vec() } else { own };
-        let mut clients = WebPkiClientVerifier::builder_with_provider(Arc::clone(&roots), crypto());
-        let mut servers = WebPkiServerVerifier::builder_with_provider(roots, crypto());
+        let mut client_builder =
+            WebPkiClientVerifier::builder_with_provider(Arc::clone(&roots), crypto());
+        let mut server_builder = WebPkiServerVerifier::builder_with_provider(roots, crypto());
         if !lists.is_empty() {
-            clients = clients
+            client_builder = client_builder
                 .with_crls(lists.iter().cloned())
                 .only_check_end_entity_revocation();
-            servers = servers.with_crls(lists).only_check_end_entity_revocation();
+            server_builder = server_builder
+                .with_crls(lists)
+                .only_check_end_entity_revocation();
         }
-        let clients = clients.build().map_err(|error| unusable(&error))?;
-        let servers = servers.build().map_err(|error| unusable(&error))?;
+        let clients = client_builder.build().map_err(|error| unusable(&error))?;
+        let servers = server_builder.build().map_err(|error| unusable(&error))?;
         Ok(Self {
             certificate,
             clients,

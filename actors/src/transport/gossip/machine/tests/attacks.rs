@@ -19,7 +19,7 @@ fn recorded_frames_change_nothing() {
     cell.start(4, "node-4");
     cell.run(3000);
     cell.assert_complete();
-    cell.forget_events();
+    cell.clear_events();
     let recorded = std::mem::take(&mut cell.recorded);
     for (from, _, frame) in &recorded {
         for to in 1..=4 {
@@ -118,7 +118,7 @@ proptest! {
         let mut cell = Cell::new(true);
         (1..=3).for_each(|node| cell.start(node, &name(node)));
         cell.run(1000);
-        cell.forget_events();
+        cell.clear_events();
         let now = cell.now;
         let node = cell.nodes.get_mut(&1).unwrap();
         let members = node.machine.members();
@@ -137,8 +137,8 @@ proptest! {
         prop_assert_eq!(node.machine.members(), members);
         while let Some(output) = node.machine.poll() {
             // A greeting with a wrong seal may come from a node with another key.
-            let is_notice = matches!(output, GossipOutput::Tell(MembershipEvent::Troubled { .. }));
-            prop_assert!(is_notice || !matches!(output, GossipOutput::Tell(_)), "{:?}", output);
+            let is_notice = matches!(output, GossipOutput::Event(MembershipEvent::Troubled { .. }));
+            prop_assert!(is_notice || !matches!(output, GossipOutput::Event(_)), "{:?}", output);
         }
     }
 }

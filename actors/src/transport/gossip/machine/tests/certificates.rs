@@ -50,7 +50,7 @@ impl CertifiedCell {
 }
 
 #[test]
-fn nodes_with_certificates_meet() {
+fn nodes_with_certificates_join() {
     let mut certified = CertifiedCell::of(6);
     certified.cell.assert_complete();
     certified.cell.nodes.remove(&3);
@@ -82,7 +82,7 @@ fn certified_namesake_of_seed_gives_up() {
 }
 
 #[test]
-fn certified_nodes_meet_by_seed() {
+fn certified_nodes_join_by_seed() {
     let mut certified = CertifiedCell::new(false);
     for node in 1..=5 {
         certified.start(node);
@@ -107,7 +107,7 @@ fn certified_cell_forms_despite_loss() {
 fn key_alone_admits_no_node() {
     let mut certified = CertifiedCell::of(3);
     let now = certified.cell.now.micros();
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     certified.cell.start(4, "node-4");
     let strange = TestAuthority::new().identity("node-5", Role::Auto);
     certified
@@ -135,7 +135,7 @@ fn key_alone_admits_no_node() {
 #[test]
 fn revoked_node_needs_new_certificate() {
     let mut certified = CertifiedCell::of(4);
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     certified.authority.revoke(&node_name(4));
     for node in 1..=3 {
         let files = certified.authority.files(&node_name(node));
@@ -146,7 +146,7 @@ fn revoked_node_needs_new_certificate() {
         ];
         assert_eq!(certified.events(node), gone, "{node}");
     }
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     certified.cell.run(5000);
     for node in 1..=3 {
         assert_eq!(certified.events(node), [], "{node}");
@@ -161,7 +161,7 @@ fn revoked_node_needs_new_certificate() {
 #[test]
 fn renewed_certificate_reaches_all() {
     let mut certified = CertifiedCell::of(3);
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     let renewed = certified.authority.identity("node-1", Role::Auto);
     certified.set_identity(1, renewed);
     certified.cell.run(3000);
@@ -191,7 +191,7 @@ fn node_with_wrong_clock_waits() {
 #[test]
 fn lost_sessions_recover_within_second() {
     let mut certified = CertifiedCell::of(2);
-    certified.machine(1).sessions.forget_all();
+    certified.machine(1).sessions.drop_all();
     for _ in 0..20 {
         for (from, to) in [(1, 2), (2, 1)] {
             let now = certified.cell.now;
@@ -199,7 +199,7 @@ fn lost_sessions_recover_within_second() {
         }
         certified.cell.run(50);
     }
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     for (from, to) in [(1, 2), (2, 1)] {
         let now = certified.cell.now;
         certified.machine(from).send(&node_name(to), b"beat", now);
@@ -219,7 +219,7 @@ fn lost_sessions_recover_within_second() {
 #[test]
 fn false_statement_overrides_no_node() {
     let mut certified = CertifiedCell::of(3);
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     let before = certified.machine(1).members();
     for life in [u64::MAX, 1 << 53, certified.cell.now.micros() + 1000] {
         let gossip = address(9);
@@ -254,7 +254,7 @@ fn false_statement_overrides_no_node() {
 #[test]
 fn sending_node_stays_alive() {
     let mut certified = CertifiedCell::of(3);
-    certified.cell.forget_events();
+    certified.cell.clear_events();
     for round in 0..60 {
         let own = certified.machine(3).gossip.own().clone();
         let now = certified.cell.now;

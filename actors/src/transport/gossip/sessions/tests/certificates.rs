@@ -300,7 +300,7 @@ fn swapped_handshake_parts_are_refused() {
     assert!(
         matches!(
             a.open(&accept, b.address, NOW + SLOW),
-            Ok(FrameContent::Met { .. })
+            Ok(FrameContent::Introduced { .. })
         ),
         "the honest one counts"
     );
@@ -402,7 +402,7 @@ fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
     let accept = answer(restarted.open(&proof, a.address, at));
     matches!(
         a.open(&accept, restarted.address, at),
-        Ok(FrameContent::Met { .. })
+        Ok(FrameContent::Introduced { .. })
     )
 }
 

@@ -23,7 +23,7 @@ use crate::testbed::{Cav, Scene, Testbed};
 
 /// One scene to be run.
 #[derive(Debug, Clone, Copy)]
-pub struct Trial<'a> {
+pub struct SceneRun<'a> {
     /// The camera and the placards of the scenes.
     pub testbed: &'a Testbed,
     /// The scene that is run.
@@ -37,7 +37,7 @@ pub struct Trial<'a> {
 /// When virtual time begins.
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
-impl Trial<'_> {
+impl SceneRun<'_> {
     /// Fuses the reports of the scene's vehicles and evaluates the maps.
     pub fn run(&self, reports: &BTreeMap<NodeName, Vec<ObjectReport>>) -> SceneResult {
         let mut fused = self.aggregator(Algorithms::Pace);
@@ -51,7 +51,10 @@ impl Trial<'_> {
             .iter()
             .map(|cav| (cav.name.clone(), unscored()))
             .collect();
-        let [mut score, mut paper, mut votes, mut answers] = [SpotScore::default(); 4];
+        let mut score = SpotScore::default();
+        let mut paper = SpotScore::default();
+        let mut votes = SpotScore::default();
+        let mut answers = SpotScore::default();
         for verdict in 0..self.verdicts {
             let steps =
                 verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();

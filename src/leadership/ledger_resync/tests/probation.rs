@@ -5,7 +5,7 @@ use super::*;
 /// A candidate that starts first receives the claim of `gauss`, and follows it until the leader
 /// renews its term.
 #[test]
-fn claimants_counts_are_forgotten() {
+fn claimants_counts_are_dropped() {
     for has_led in [false, true] {
         let mut edge = signing("edge", 7, "edge");
         let mut euclid = signing("other", 8, "gauss");

@@ -172,7 +172,7 @@ impl NeighbourTracks {
     }
 
     /// Removes objects whose maps were fused before `limit`, and vehicles for which `known` returns false.
-    pub(super) fn forget(&mut self, limit: Timestamp, known: impl Fn(SensorId) -> bool) {
+    pub(super) fn drop_before(&mut self, limit: Timestamp, known: impl Fn(SensorId) -> bool) {
         self.objects.retain(|object| object.fused_at >= limit);
         self.objects
             .iter_mut()
@@ -281,18 +281,18 @@ impl NeighbourTracks {
         &mut self,
         max_each: usize,
         at: Timestamp,
-        is_looked_at: impl Fn(&Vector2<f64>) -> bool,
+        is_observed: impl Fn(&Vector2<f64>) -> bool,
     ) -> impl Iterator<Item = &mut Track> {
         let mut left = BTreeMap::new();
-        let looked_at = self.objects.iter_mut().filter(move |object| {
-            object.is_stated() && is_looked_at(&object.track.state.position_at(at)) && {
+        let observed = self.objects.iter_mut().filter(move |object| {
+            object.is_stated() && is_observed(&object.track.state.position_at(at)) && {
                 let left: &mut usize = left.entry(object.cell.clone()).or_insert(max_each);
                 let has_room = *left > 0;
                 *left = left.saturating_sub(1);
                 has_room
             }
         });
-        looked_at.map(|object| &mut object.track)
+        observed.map(|object| &mut object.track)
     }
 
     /// True if no neighbouring cell has an object.

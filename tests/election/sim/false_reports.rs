@@ -33,22 +33,23 @@ fn false_claim_takes_no_lead() {
                     world.nodes[node].config.priority,
                 )
             };
-            let may_lie = |world: &World, node: usize| {
+            let may_be_faulty = |world: &World, node: usize| {
                 node != leader
                     && rank(node).0 != Role::Cav
                     && (world.nodes.len() > 2 || rank(node) != rank(leader))
             };
-            let Some(liar) = (0..world.nodes.len()).find(|node| may_lie(world, *node)) else {
+            let Some(faulty) = (0..world.nodes.len()).find(|node| may_be_faulty(world, *node))
+            else {
                 return Ok(());
             };
             one_best_leader(world)?;
             world.loss_percent = seed % 6;
             let before = world.led.len();
-            for lie in 0..1000 {
-                tell_lies(world, liar, leader, FORGED + lie);
+            for report in 0..1000 {
+                send_false_reports(world, faulty, leader, FORGED + report);
                 world.run_for(10 * MS);
                 ensure(world.nodes[leader].leads(), "the leader stepped down")?;
-                for (index, node) in world.alive().filter(|(index, _)| *index != liar) {
+                for (index, node) in world.alive().filter(|(index, _)| *index != faulty) {
                     let follows = node.leader() == Some(&world.nodes[leader].name);
                     ensure(
                         index == leader || follows,
@@ -82,7 +83,7 @@ fn vouched_hung_leader_is_replaced() {
                 .filter(|node| is_candidate(*node))
                 .collect();
             // Needs a second, honest candidate; large cells take too long.
-            let [liar, _, ..] = candidates[..] else {
+            let [faulty, _, ..] = candidates[..] else {
                 return Ok(());
             };
             if world.nodes.len() > 8 {
@@ -100,16 +101,19 @@ fn vouched_hung_leader_is_replaced() {
             let has_taken_over = |world: &World| {
                 world
                     .alive()
-                    .any(|(node, state)| node != leader && node != liar && state.leads())
-                    || world.nodes[liar].leads()
+                    .any(|(node, state)| node != leader && node != faulty && state.leads())
+                    || world.nodes[faulty].leads()
             };
-            let lie = LIES.iter().find(|lie| lie.message == "vouch").unwrap();
+            let report = FALSE_REPORTS
+                .iter()
+                .find(|report| report.message == "vouch")
+                .unwrap();
             let mut seq = FORGED;
             while !has_taken_over(world) {
                 // Query numbers are small.
                 for _ in 0..100 {
                     seq += 1;
-                    tell(world, lie, liar, leader, seq, &life);
+                    send(world, report, faulty, leader, seq, &life);
                 }
                 world.run_for(20 * MS);
                 ensure(
@@ -124,7 +128,7 @@ fn vouched_hung_leader_is_replaced() {
 
 /// Names and state of the cell from which a false message is made.
 struct Scene {
-    liar: NodeName,
+    faulty: NodeName,
     /// The present leadership, and its last sign of life.
     present: Epoch,
     life: LifeSign,
@@ -140,9 +144,9 @@ struct Statement {
 }
 
 /// One kind of false message that a member sends.
-struct Lie {
+struct FalseReport {
     message: &'static str,
-    lie: &'static str,
+    description: &'static str,
     /// True if the message claims the lead for its sender.
     claims: bool,
     state: fn(&Scene) -> Statement,
@@ -201,52 +205,52 @@ fn claim(round: u64, after: Option<&Epoch>) -> Body {
 }
 
 /// Every message of the election, with what can be false in it.
-const LIES: [Lie; 16] = [
-    Lie {
+const FALSE_REPORTS: [FalseReport; 16] = [
+    FalseReport {
         message: "status",
-        lie: "follows a later leadership of another node",
+        description: "follows a later leadership of another node",
         claims: false,
         state: |scene| scene.of_next(&scene.other, status(None, &[])),
     },
-    Lie {
+    FalseReport {
         message: "status",
-        lie: "the present leadership is over",
+        description: "the present leadership is over",
         claims: false,
         state: |scene| scene.without_leader(status(Some(&scene.present), &[])),
     },
-    Lie {
+    FalseReport {
         message: "status",
-        lie: "no login at the leader's broker and another",
+        description: "no login at the leader's broker and another",
         claims: false,
         state: |scene| scene.of_present(status(None, &[&scene.present.leader, &scene.other])),
     },
-    Lie {
+    FalseReport {
         message: "status",
-        lie: "receives nobody",
+        description: "receives nobody",
         claims: false,
         state: |scene| Statement {
             hears_you: false,
             ..scene.of_present(status(None, &[]))
         },
     },
-    Lie {
+    FalseReport {
         message: "status",
-        lie: "the largest term",
+        description: "the largest term",
         claims: false,
         state: |scene| Statement {
             term: MAX_TERM,
             ..scene.of_present(status(None, &[]))
         },
     },
-    Lie {
+    FalseReport {
         message: "ask",
-        lie: "has no leader, all the time",
+        description: "has no leader, all the time",
         claims: false,
         state: |scene| scene.without_leader(Body::Ask { ask: scene.seq }),
     },
-    Lie {
+    FalseReport {
         message: "vouch",
-        lie: "received the leader just now",
+        description: "received the leader just now",
         claims: false,
         state: |scene| {
             scene.of_present(Body::LeaderEvidence {
@@ -256,9 +260,9 @@ const LIES: [Lie; 16] = [
             })
         },
     },
-    Lie {
+    FalseReport {
         message: "vouch",
-        lie: "received another node, which leads",
+        description: "received another node, which leads",
         claims: false,
         state: |scene| {
             let body = Body::LeaderEvidence {
@@ -269,48 +273,48 @@ const LIES: [Lie; 16] = [
             scene.of_next(&scene.other, body)
         },
     },
-    Lie {
+    FalseReport {
         message: "beat",
-        lie: "leads, with 200 followers",
+        description: "leads, with 200 followers",
         claims: true,
-        state: |scene| scene.of_next(&scene.liar, claim(1, None)),
+        state: |scene| scene.of_next(&scene.faulty, claim(1, None)),
     },
-    Lie {
+    FalseReport {
         message: "beat",
-        lie: "leads after the present leader",
+        description: "leads after the present leader",
         claims: true,
-        state: |scene| scene.of_next(&scene.liar, claim(1, Some(&scene.present))),
+        state: |scene| scene.of_next(&scene.faulty, claim(1, Some(&scene.present))),
     },
-    Lie {
+    FalseReport {
         message: "beat",
-        lie: "leads, and does not receive the leader",
+        description: "leads, and does not receive the leader",
         claims: true,
         state: |scene| Statement {
             hears_you: false,
-            ..scene.of_next(&scene.liar, claim(1, Some(&scene.present)))
+            ..scene.of_next(&scene.faulty, claim(1, Some(&scene.present)))
         },
     },
-    Lie {
+    FalseReport {
         message: "beat",
-        lie: "leads, in the largest round",
+        description: "leads, in the largest round",
         claims: true,
-        state: |scene| scene.of_next(&scene.liar, claim(MAX_ROUND, Some(&scene.present))),
+        state: |scene| scene.of_next(&scene.faulty, claim(MAX_ROUND, Some(&scene.present))),
     },
-    Lie {
+    FalseReport {
         message: "offer",
-        lie: "wants to hand over a lead that it does not have",
+        description: "wants to hand over a lead that it does not have",
         claims: false,
         state: |scene| scene.of_present(Body::Offer),
     },
-    Lie {
+    FalseReport {
         message: "ready",
-        lie: "is about to lead",
+        description: "is about to lead",
         claims: false,
         state: |scene| scene.of_present(Body::Ready),
     },
-    Lie {
+    FalseReport {
         message: "yield",
-        lie: "hands over a lead that it does not have, in the largest round",
+        description: "hands over a lead that it does not have, in the largest round",
         claims: false,
         state: |scene| {
             scene.of_present(Body::Yield {
@@ -318,13 +322,13 @@ const LIES: [Lie; 16] = [
             })
         },
     },
-    Lie {
+    FalseReport {
         message: "resign",
-        lie: "ends a leadership of its own, far ahead",
+        description: "ends a leadership of its own, far ahead",
         claims: false,
         state: |scene| {
             let term = scene.present.term + MAX_TERM_STEP / 2;
-            let epoch = Epoch::new(term, scene.liar.clone());
+            let epoch = Epoch::new(term, scene.faulty.clone());
             let body = Body::Resign {
                 epoch,
                 last_round: 0,
@@ -355,10 +359,11 @@ const MAX_GAP: u64 = SECOND;
 /// messages and attacks.
 #[test]
 fn false_claims_cost_no_maps() {
-    let mut outcomes = [Outcome::default(); LIES.len()];
+    let mut outcomes = [Outcome::default(); FALSE_REPORTS.len()];
     for_seeds(seeds(), |seed| {
-        let number = seed as usize % LIES.len();
-        if let Some(outcome) = outcome_of(&LIES[number], seed / LIES.len() as u64) {
+        let number = seed as usize % FALSE_REPORTS.len();
+        if let Some(outcome) = outcome_of(&FALSE_REPORTS[number], seed / FALSE_REPORTS.len() as u64)
+        {
             let worst = &mut outcomes[number];
             worst.cells += 1;
             worst.changes = worst.changes.max(outcome.changes);
@@ -371,13 +376,13 @@ fn false_claims_cost_no_maps() {
         "| message | false statement | cells | changes of leadership | longest gap in ms | with a hung leader |"
     );
     println!("|---|---|---|---|---|---|");
-    for (lie, outcome) in LIES.iter().zip(outcomes) {
-        let Lie {
+    for (report, outcome) in FALSE_REPORTS.iter().zip(outcomes) {
+        let FalseReport {
             message,
-            lie,
+            description,
             claims,
             ..
-        } = lie;
+        } = report;
         let Outcome {
             cells,
             longest_gap,
@@ -389,12 +394,12 @@ fn false_claims_cost_no_maps() {
         } else {
             hung_gap
         };
-        println!("| `{message}` | {lie} | {cells} | {changes} | {gap} | {hung_gap} |");
+        println!("| `{message}` | {description} | {cells} | {changes} | {gap} | {hung_gap} |");
     }
 }
 
 /// Outcome of a lie in one cell; `None` in a cell too small or too large for it.
-fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
+fn outcome_of(report: &FalseReport, seed: u64) -> Option<Outcome> {
     let mut world = cell(seed);
     if !(3..=8).contains(&world.nodes.len()) {
         return None;
@@ -410,35 +415,35 @@ fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
             .filter(|node| *node != leader)
             .collect();
         // Some honest node takes over. A standby that stays silent is another fault.
-        let may_lie =
-            |world: &World, liar: usize| Some(&world.nodes[liar].name) != standby.as_ref();
-        let liars: Vec<usize> = others
+        let may_be_faulty =
+            |world: &World, faulty: usize| Some(&world.nodes[faulty].name) != standby.as_ref();
+        let faulty_nodes: Vec<usize> = others
             .into_iter()
-            .filter(|node| may_lie(world, *node))
+            .filter(|node| may_be_faulty(world, *node))
             .collect();
-        if standby.is_none() || liars.is_empty() {
+        if standby.is_none() || faulty_nodes.is_empty() {
             return Ok(());
         }
-        let liar = liars[world.random.index(liars.len())];
+        let faulty = faulty_nodes[world.random.index(faulty_nodes.len())];
         let life = life_of(world, leader);
         let mut longest_gap = [0; 2];
         let before = world.led.len();
         let mut seq = FORGED;
-        let mut lie_for = |world: &mut World, micros: u64| {
+        let mut report_for = |world: &mut World, micros: u64| {
             let end = world.now + micros;
             while world.now < end {
                 seq += 1;
-                tell(world, lie, liar, leader, seq, &life);
+                send(world, report, faulty, leader, seq, &life);
                 world.run_for(10 * MS);
             }
         };
         let from = world.now;
-        lie_for(world, 3 * SECOND);
+        report_for(world, 3 * SECOND);
         ensure(world.nodes[leader].leads(), "the leader stepped down")?;
         let changes = world.led.len() - before;
-        longest_gap[0] = longest_gap_of(world, &[liar, leader], from)?;
+        longest_gap[0] = longest_gap_of(world, &[faulty, leader], from)?;
         // A candidate that claims the lead of a hung leader gets it.
-        if !lie.claims {
+        if !report.claims {
             world.plan(
                 0,
                 Fault::Pause {
@@ -447,13 +452,16 @@ fn outcome_of(lie: &Lie, seed: u64) -> Option<Outcome> {
                 },
             );
             let from = world.now;
-            lie_for(world, 3 * SECOND);
-            longest_gap[1] = longest_gap_of(world, &[liar, leader], from)?;
+            report_for(world, 3 * SECOND);
+            longest_gap[1] = longest_gap_of(world, &[faulty, leader], from)?;
         }
         let longest = longest_gap[0].max(longest_gap[1]);
         ensure(
             longest <= MAX_GAP,
-            &format!("{}: {}: {longest} µs without a map", lie.message, lie.lie),
+            &format!(
+                "{}: {}: {longest} µs without a map",
+                report.message, report.description
+            ),
         )?;
         outcome = Some(Outcome {
             cells: 1,
@@ -498,19 +506,26 @@ fn life_of(world: &World, leader: usize) -> LifeSign {
 }
 
 /// Sends a false message of a random kind to every honest node.
-fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
-    let lie = loop {
-        let lie = &LIES[world.random.index(LIES.len())];
+fn send_false_reports(world: &mut World, faulty: usize, leader: usize, seq: u64) {
+    let report = loop {
+        let report = &FALSE_REPORTS[world.random.index(FALSE_REPORTS.len())];
         // In a cell of two, a leader without followers yields to a claimant that does not receive it.
-        if world.nodes.len() > 2 || lie.lie != "leads, and does not receive the leader" {
-            break lie;
+        if world.nodes.len() > 2 || report.description != "leads, and does not receive the leader" {
+            break report;
         }
     };
-    tell(world, lie, liar, leader, seq, &LifeSign::default());
+    send(world, report, faulty, leader, seq, &LifeSign::default());
 }
 
-/// Sends a false message of node `liar` about the leader to every honest node. `life` is the leader's sign of life in it.
-fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life: &LifeSign) {
+/// Sends a false message of node `faulty` about the leader to every honest node. `life` is the leader's sign of life in it.
+fn send(
+    world: &mut World,
+    report: &FalseReport,
+    faulty: usize,
+    leader: usize,
+    seq: u64,
+    life: &LifeSign,
+) {
     let Some(present) = world.nodes[leader]
         .election()
         .and_then(|election| election.epoch().cloned())
@@ -518,9 +533,9 @@ fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life
         return;
     };
     let other = world.random.index(world.nodes.len());
-    let name = world.nodes[liar].name.clone();
+    let name = world.nodes[faulty].name.clone();
     let scene = Scene {
-        liar: name.clone(),
+        faulty: name.clone(),
         present,
         life: life.clone(),
         other: world.nodes[other].name.clone(),
@@ -531,8 +546,8 @@ fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life
         epoch,
         hears_you,
         body,
-    } = (lie.state)(&scene);
-    let ElectionConfig { role, priority, .. } = world.nodes[liar].config;
+    } = (report.state)(&scene);
+    let ElectionConfig { role, priority, .. } = world.nodes[faulty].config;
     let message = ElectionMessage {
         schema: SCHEMA_VERSION,
         from: name.clone(),
@@ -551,7 +566,7 @@ fn tell(world: &mut World, lie: &Lie, liar: usize, leader: usize, seq: u64, life
         clock: None,
         description: None,
     };
-    for to in (0..world.nodes.len()).filter(|to| *to != liar) {
+    for to in (0..world.nodes.len()).filter(|to| *to != faulty) {
         if world.nodes[to].paused_until > world.now {
             continue;
         }

@@ -14,7 +14,7 @@ fn stated(cell: &str, age_s: f64, object: FusedObject) -> NeighbourObject {
 }
 
 /// A car that a neighbouring cell follows.
-fn foreign_car(number: u128, x_m: f64, y_m: f64, velocity_mps: [f64; 2]) -> FusedObject {
+fn neighbour_car(number: u128, x_m: f64, y_m: f64, velocity_mps: [f64; 2]) -> FusedObject {
     FusedObject {
         existence: Some(0.97),
         scores: BTreeMap::from([("car".into(), 1.0)]),
@@ -48,7 +48,7 @@ fn watching(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectRepo
 }
 
 #[test]
-fn foreign_object_keeps_identity_and_velocity() {
+fn neighbours_object_keeps_identity_and_velocity() {
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();
     for frame in 0..30 {
@@ -56,7 +56,7 @@ fn foreign_object_keeps_identity_and_velocity() {
         // take 100 ms.
         let x_m = frame as f64 - 20.0;
         if frame % 5 == 0 && frame <= 15 {
-            let car = stated("west", 0.1, foreign_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
+            let car = stated("west", 0.1, neighbour_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
             tracker.on_neighbours(std::slice::from_ref(&car), at(frame));
             assert_eq!(
                 tracker.hides(&car),
@@ -239,7 +239,7 @@ fn unconfirmed_cell_loses_trust() {
         stated(
             "liar",
             0.1,
-            foreign_car(number, 4.0 * number as f64 - 20.0, -20.0, [0.0, 0.0]),
+            neighbour_car(number, 4.0 * number as f64 - 20.0, -20.0, [0.0, 0.0]),
         )
     };
     lied_to(&mut tracker, |_, _| (0..8).map(ghost).collect());
@@ -267,7 +267,7 @@ fn identity_changes_do_not_evade_judgement() {
     let mut tracker = tracker();
     lied_to(&mut tracker, |frame, _| {
         let ghost = |number: u128| {
-            foreign_car(
+            neighbour_car(
                 1000 * u128::from(frame) + number,
                 4.0 * number as f64 - 20.0,
                 -20.0,
@@ -299,7 +299,7 @@ proptest! {
                 let first_seen_us = Some(Timestamp(rng.random_range(0..START.0)));
                 let sigma_m = 10_f64.powf(noise(rng, 2.0));
                 let covariance_m2 = Covariance::isotropic(sigma_m).into();
-                let ghost = foreign_car(number, x_m + noise(rng, 2.0), y_m + noise(rng, 2.0), velocity_mps);
+                let ghost = neighbour_car(number, x_m + noise(rng, 2.0), y_m + noise(rng, 2.0), velocity_mps);
                 FusedObject { id, first_seen_us, covariance_m2, ..ghost }
             };
             let number = |place: u64| u128::from(if frame % 4 == 0 { place } else { 100 * frame + place });
