@@ -41,8 +41,8 @@ pub struct ElectionConfig {
     pub stable_ms: u64,
     /// Time after which the leader gives up a handover, in ms. Default 3000.
     pub handover_ms: u64,
-    /// Delay of a timer in ms above which the node counts as stalled; only this much of the delay
-    /// counts as elapsed time. Default 40.
+    /// Delay of a timer in ms above which the node counts as stalled. Default 40. Only this much of
+    /// the delay counts as elapsed time.
     pub stall_ms: u64,
 }
 

@@ -19,8 +19,8 @@ use crate::wire::PerceivedObject;
 config_section! {
     /// Conditions for a location to be in view.
     pub struct ViewConfig {
-        /// Width of the target or object to be recognised at a location, in metres; by default the
-        /// smallest configured size or, without any, 0.05.
+        /// Width in metres of the target to recognise at a location. Default: the smallest
+        /// configured size, or 0.05.
         pub target_width_m: Option<f64> = None, checked by check_optional(1e-4, 1e3);
         /// Minimum width in pixels of the target at its actual angle; default 36: a placard code of
         /// 21 modules at 1.7 pixels each. A lower value claims more locations, some of which the

@@ -26,8 +26,8 @@ pub enum TracksMode {
 pub struct TracksConfig {
     /// Cells that track objects; `auto` means cells without landmarks. Default `auto`.
     pub mode: TracksMode,
-    /// Standard deviation in metres, in each direction, of near positions without covariance, until it
-    /// is estimated; 0.012 m more for each metre of distance. Default 0.15.
+    /// Standard deviation in metres of near positions without covariance, until it is estimated.
+    /// Default 0.15. It applies to each direction, and grows by 0.012 m for each metre of distance.
     pub noise_m: f64,
     /// Minimum standard deviation in metres of any reported position. Default 0.1.
     pub noise_floor_m: f64,
@@ -42,13 +42,14 @@ pub struct TracksConfig {
     /// Standard deviation in metres per second of the change of velocity within a second. Default 2.2. Trade-off: a
     /// larger value follows manoeuvres; a smaller value smooths.
     pub manoeuvre_mps: f64,
-    /// Standard deviation of an object's unknown velocity in metres per second, in each direction. Default 8.
+    /// Standard deviation of an object's unknown velocity in metres per second. Default 8. It
+    /// applies to each direction.
     pub speed_mps: f64,
     /// Maximum speed in metres per second. Default 70.
     pub max_speed_mps: f64,
     /// Maximum time in seconds for which an object is published after its last detection. Default 3.
     pub life_s: f64,
-    /// Maximum time in seconds for which an object keeps its identity after its last detection, published or not.
+    /// Maximum time in seconds for which an object keeps its identity after its last detection.
     /// Default 8.
     pub latent_s: f64,
     /// Maximum time in seconds of a report behind the latest report that was fused. Default 0.5; later reports are
@@ -63,15 +64,14 @@ pub struct TracksConfig {
     /// Label of a vehicle that no other vehicle has detected. Default `car`: the label that the cell's detectors give
     /// vehicles.
     pub vehicle_label: Label,
-    /// Estimation and correction of the offsets and rotations of vehicles' poses, and of the delays of their stamps.
-    /// Default true.
+    /// Whether errors of vehicles' poses and stamps are estimated and corrected. Default true.
     pub align: bool,
     /// Standard deviation in metres of a pose's offset. Default 0.5.
     pub align_offset_m: f64,
     /// Standard deviation in radians of a pose's rotation. Default 0.01.
     pub align_heading_rad: f64,
-    /// Standard deviation in seconds of the delay of a vehicle's stamps, in addition to the measured offset of its
-    /// clock. Default 0.02. The correction is at most three times as large.
+    /// Standard deviation in seconds of the delay of a vehicle's stamps. Default 0.02. The delay
+    /// adds to the measured offset of its clock; the correction is at most three times as large.
     pub align_delay_s: f64,
     /// Time constant in seconds of the errors of a pose. Default 10.
     pub align_memory_s: f64,

@@ -44,8 +44,8 @@ pub struct VoteConfig {
     /// labels of the vehicle that introduced most. In `paper` mode, whose sums are permanent, votes
     /// for new labels are ignored.
     pub max_labels: usize,
-    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's
-    /// own synonyms have precedence. Default: no synonyms.
+    /// Labels that count as another one everywhere, such as `vase = "sports ball"`. Default: no
+    /// synonyms. A landmark's own synonyms have precedence.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
 }

@@ -63,8 +63,8 @@ fn yes() -> bool {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpticsConfig {
-    /// Calibration file of `ecod-node calibrate`, which replaces the other keys; frames of another
-    /// size are scaled, of another shape refused. Default: not set.
+    /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default: not set.
+    /// Frames of another size are scaled, of another shape refused.
     pub calibration: Option<PathBuf>,
     /// Image width in pixels; without both sizes, frames may have any shape. Default: not set.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -448,7 +448,9 @@ impl BirdseyePicture<'_> {
                 .add(line(0.0, -8.0, 0.0, 8.0).set("stroke-width", weight))
         };
         for (cav, color) in self.vehicles() {
-            let dots = [(-5.0, 2.0), (0.0, -3.0), (5.0, 3.0)].into_iter().map(dot);
+            let dots = [(-5.0, 2.0), (0.0, -3.0), (5.0, 3.0)]
+                .into_iter()
+                .map(|(x, y)| dot(x, y));
             entry(
                 dots.fold(Group::new().set("fill", color), Group::add),
                 &format!("seen by {}", cav.name),

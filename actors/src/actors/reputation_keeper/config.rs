@@ -13,8 +13,8 @@ pub struct ReputationKeeperConfig {
     /// Seconds between publications; changes are saved before each. Default 1. A higher value
     /// reduces writes to a flash disk, and loses correspondingly more evidence when a node crashes.
     pub publish_period_s: f64,
-    /// Seconds between shares of all evidence with the other candidates, in addition to changes
-    /// shared after each round. Default 10. A lower value repairs lost shares sooner.
+    /// Seconds between shares of all evidence with the other candidates. Default 10. Changes are
+    /// shared after each round.
     pub snapshot_period_s: f64,
 }
 

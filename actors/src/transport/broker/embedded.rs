@@ -90,9 +90,8 @@ pub enum BrokerError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct BrokerConfig {
-    /// Whether local programs can connect to the cell at the node's own `listen` address,
-    /// independent of which node leads; default true. With false, only nodes that may lead have a
-    /// broker, and it is for nodes. Trade-off: a local broker costs some megabytes.
+    /// Whether the node runs a broker for programs beside it, also while another node leads.
+    /// Default true. Without it only candidates run a broker, for nodes.
     pub door: bool,
     /// Largest MQTT packet in bytes; default: derived from `mqtt.max_map_bytes` and
     /// `mqtt.max_payload_bytes`. A client that sends a larger one is cut off. Trade-off: a larger

@@ -50,10 +50,10 @@ pub struct MembershipConfig {
     pub suspect_ms: u64,
     /// Time between two rounds of gossip, in ms. Default 50; rounds without news send no packets.
     pub gossip_ms: u64,
-    /// Interval in ms between greetings to absent seeds and to the multicast group (tenfold for the
-    /// group once other nodes are alive); at most half of `join_ms`. Default 500. A returning seed
-    /// must discover its cell before it leads on its own. Trade-off: a shorter time heals split
-    /// cells sooner and costs packets.
+    /// Interval in ms between greetings to absent seeds and to the multicast group; at most half of
+    /// `join_ms`. Default 500. Once other nodes are alive, the group is greeted a tenth as often. A
+    /// returning seed must discover its cell before it leads on its own. Trade-off: a shorter time
+    /// heals split cells sooner and costs packets.
     pub hello_ms: u64,
     /// Maximum number of other nodes. Default 256.
     pub max_peers: usize,
