@@ -180,6 +180,7 @@ snapshots: ## messages, their schemas, help, error texts and tables of keys agai
 	cargo test --locked --quiet --test core messages::
 	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors:: configuration_reference:: schema::
 	cargo test --locked --quiet -p ecod-region --test engine -- help::
+	cargo test --locked --quiet -p ecod-interop --test bridges -- help::
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core
