@@ -1,5 +1,6 @@
 //! The camera of a vehicle of `try`, found from the people whom its own detector detects.
 
+use std::ops::RangeInclusive;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use ecod::model::detection::Detection;
@@ -20,6 +21,9 @@ const MAX_BOXES: usize = 5000;
 
 /// Growth of the number of boxes after which a fit is tried again.
 const RETRY_GROWTH: f64 = 1.3;
+
+/// Heights of cameras that people can determine; others come from boxes that show no people.
+const PLAUSIBLE_HEIGHT_M: RangeInclusive<f64> = 0.2..=60.0;
 
 /// Collects people until they determine height and tilt of the camera.
 pub(super) struct CameraWatch {
@@ -86,7 +90,10 @@ impl CameraWatch {
         let snapshot = people.clone();
         drop(people);
         match snapshot.fit() {
-            Ok(estimate) => Some(estimate),
+            Ok(estimate) => Some(estimate).filter(|estimate| {
+                let height_m = estimate.mount.height_m;
+                height_m.is_some_and(|height_m| PLAUSIBLE_HEIGHT_M.contains(&height_m))
+            }),
             Err(error) => {
                 tracing::debug!(%error, "people do not determine the camera yet");
                 None
