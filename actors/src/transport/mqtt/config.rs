@@ -56,7 +56,7 @@ pub struct MqttConfig {
     /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones
     /// are dropped and counted.
     pub inbox: usize,
-    /// Maximum reports per second of one vehicle and kind, where the largest count sixfold, shares of
+    /// Maximum reports per second of one vehicle and kind, where the largest count twelvefold, shares of
     /// evidence of one candidate, and statuses of one node; default 100. The same number is the burst. Further ones are not
     /// decoded, and counted by node. Trade-off: a higher value lets one node take the processor
     /// time of others.
