@@ -19,6 +19,10 @@ const OBJECTS: usize = 50;
 const SPACING_M: f64 = 8.0;
 /// Objects along each side of the area, for each observer of the same row.
 const PER_OBSERVER: f64 = 3.0;
+/// Objects of the largest report.
+const CROWD: usize = 1000;
+/// Distance within which the largest report has all its objects, metres.
+const CROWD_RADIUS_M: f64 = 20.0;
 
 fn main() {
     let mut figures = Figures::new("tracks");
@@ -36,7 +40,45 @@ fn main() {
         20.0,
         " ms",
     );
+    crowd(&mut figures);
     figures.save();
+}
+
+/// Prints and takes the median time of a round with the largest report of one vehicle: people that are packed within
+/// [`CROWD_RADIUS_M`].
+fn crowd(figures: &mut Figures) {
+    let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
+    let mut times: Vec<Duration> = (1..=40)
+        .map(|frame| {
+            let now = NOON + Duration::from_millis(100 * frame);
+            let objects = (0..CROWD).map(|number| person(number, frame)).collect();
+            let report = ObjectReport {
+                objects,
+                ..ObjectReport::new(NodeName::from_static("crowd"), frame, now)
+            };
+            elapsed(|| {
+                tracker.observe(report, now);
+                std::hint::black_box(tracker.close(now));
+            })
+        })
+        .skip(15)
+        .collect();
+    times.sort();
+    figures.goal(
+        "tracks_report_of_1000_objects_within_20_m",
+        times[times.len() / 2].as_secs_f64() * 1e3,
+        5.0,
+        " ms",
+    );
+}
+
+/// A person of a crowd about a place; all sway by up to 2 m.
+fn person(number: usize, frame: u64) -> PerceivedObject {
+    let turn = std::f64::consts::TAU * (number * 89 % CROWD) as f64 / CROWD as f64;
+    let range_m = number as f64 % CROWD_RADIUS_M;
+    let sway_m = 0.3 * (frame % 7) as f64;
+    let x_m = 40.0 + sway_m + range_m * turn.cos();
+    PerceivedObject::new("person", 0.9, x_m, 40.0 + range_m * turn.sin())
 }
 
 /// Prints, takes and returns the median time of a round in milliseconds; the area grows with the observers.

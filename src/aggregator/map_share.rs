@@ -7,9 +7,10 @@ use crate::model::names::{Label, NodeName};
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
 /// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
-/// parts: about 950 objects with short labels, nearly as many as one report may have. Without this
-/// bound, one member's reports could make the map too large for the links to carry once per round.
-const MAX_SOLE_BYTES: usize = 1024 * (NUMBERS_BYTES + 32);
+/// parts: about 330 objects with short labels. At ten maps per second a link carries them with
+/// 10 Mbit/s. Without this bound, one member's reports could make the map too large for the links
+/// to carry once per round.
+const MAX_SOLE_BYTES: usize = 128 * 1024;
 
 /// Size in JSON of an object without its texts.
 const NUMBERS_BYTES: usize = 352;

@@ -59,6 +59,35 @@ fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
 }
 
 #[test]
+fn busy_observer_fits_its_share() {
+    let config = FusionConfig {
+        round: RoundConfig {
+            close: RoundClose::Periodic,
+            ..RoundConfig::default()
+        },
+        ..FusionConfig::default()
+    };
+    let mut cell = Aggregator::new(NodeName::from_static("edge"), 7, config, vec![], at(0));
+    let mut last = None;
+    for round in 0..30 {
+        let now = at(round * 100 + 50);
+        let objects = (0..300_u32).map(|number| {
+            let x_m = f64::from(number % 20) * 4.0;
+            PerceivedObject::new("person", 0.9, x_m, f64::from(number / 20) * 4.0)
+        });
+        let report = ObjectReport {
+            objects: objects.collect(),
+            ..ObjectReport::new(NodeName::from_static("observer"), round, now)
+        };
+        cell.report(Detections, &Arc::new(report), now).unwrap();
+        last = cell.tick(at(round * 100 + 100));
+    }
+    let fused = last.expect("rounds were closed");
+    assert_eq!(fused.map.unwrap().objects.len(), 300);
+    assert!(fused.left_out.is_empty(), "{:?}", fused.left_out);
+}
+
+#[test]
 fn expelled_vehicles_objects_leave_map() {
     let tracks = TracksConfig {
         mode: TracksMode::On,

@@ -19,8 +19,8 @@ use nalgebra::{Matrix2, Vector2};
 use smallvec::SmallVec;
 
 use super::config::TracksConfig;
-use super::existence::ObservationState;
-use super::handles::TrackIndex;
+use super::existence::{DetectionRates, ObservationState};
+use super::handles::{SensorId, TrackIndex};
 use super::kinematics::inverse;
 use super::scan::{Scan, ScannedDetection};
 use super::sensors::Sensors;
@@ -55,6 +55,10 @@ const MAX_NEW_NEAR: usize = 16;
 /// Maximum number of tracks that are compared with a detection, the nearest first.
 const MAX_TRACKS_NEAR: usize = 64;
 
+/// Maximum number of pairs of a detection and a track that are compared for one report. More would delay the round of
+/// all vehicles.
+const MAX_PAIRS: usize = 20_000;
+
 /// Probability of a detection by a vehicle whose view is unknown.
 const UNKNOWN_RATE: f64 = 0.5;
 
@@ -66,6 +70,8 @@ pub(super) struct Hypothesis {
     /// Predicted information; zero for an object that begins here.
     prior: Information,
     information: Information,
+    /// Position and covariance of `information`, metres; `None` without any.
+    estimate: Option<(Vector2<f64>, Matrix2<f64>)>,
     /// Numbers of scans and their detections, by scan.
     pub(super) hits: SmallVec<[(usize, usize); 4]>,
 }
@@ -103,6 +109,22 @@ impl Information {
 }
 
 impl Hypothesis {
+    fn new(track: Option<TrackIndex>, prior: Information) -> Self {
+        Self {
+            track,
+            prior,
+            information: prior,
+            estimate: prior.mean(),
+            hits: SmallVec::new(),
+        }
+    }
+
+    /// Adds the information of a detection, or removes it if `sign` is -1.
+    fn add(&mut self, information: &Information, sign: f64) {
+        self.information.add(information, sign);
+        self.estimate = self.information.mean();
+    }
+
     /// Position and covariance of all detections of the hypothesis together.
     pub(super) fn detected(&self) -> Option<(Vector2<f64>, Matrix2<f64>)> {
         let mut detected = self.information;
@@ -177,7 +199,7 @@ impl<'a> Assignment<'a> {
             .collect();
         if scan.is_trusted() {
             for (owner, information) in owners.iter().zip(&information) {
-                self.hypotheses[*owner].information.add(information, -1.0);
+                self.hypotheses[*owner].add(information, -1.0);
             }
         }
         let pairs = self.gated_pairs(scan);
@@ -193,7 +215,7 @@ impl<'a> Assignment<'a> {
             .collect();
         if scan.is_trusted() {
             for (owner, information) in owners.iter().zip(&information) {
-                self.hypotheses[*owner].information.add(information, 1.0);
+                self.hypotheses[*owner].add(information, 1.0);
             }
         }
     }
@@ -264,12 +286,7 @@ impl<'a> Assignment<'a> {
         if hypothesis == next {
             let state = &self.tracks[track].state;
             let prior = Information::of(&state.position_at(self.at), &state.covariance_at(self.at));
-            self.hypotheses.push(Hypothesis {
-                track: Some(track),
-                prior,
-                information: prior,
-                hits: SmallVec::new(),
-            });
+            self.hypotheses.push(Hypothesis::new(Some(track), prior));
         }
         hypothesis
     }
@@ -278,45 +295,57 @@ impl<'a> Assignment<'a> {
     /// The vehicle's own track is excluded; of many near tracks only the nearest are compared.
     fn gated_pairs(&mut self, scan: &Scan<'_>) -> Vec<GatedPair> {
         let reach_m = self.config.gate_m + self.tracks.slack_m(self.at);
+        let max_near = max_tracks_near(scan.detections.len());
+        let own_track = self.tracks.of_vehicle(scan.sensor);
         let mut pairs = Vec::with_capacity(2 * scan.detections.len());
         for (number, detection) in scan.detections.iter().enumerate() {
             let position = &detection.measurement.position;
             let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
             self.tracks.near(position, reach_m, |indexed| {
-                if self.tracks[indexed.track].vehicle != Some(scan.sensor) {
+                if Some(indexed.track) != own_track {
                     tracks.push(((indexed.position - position).norm(), indexed.track));
                 }
             });
-            if tracks.len() > MAX_TRACKS_NEAR {
-                tracks.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-                tracks.truncate(MAX_TRACKS_NEAR);
+            if tracks.len() > max_near {
+                let by_distance = |a: &(f64, TrackIndex), b: &(f64, TrackIndex)| {
+                    a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
+                };
+                tracks.select_nth_unstable_by(max_near, by_distance);
+                tracks.truncate(max_near);
+                tracks.sort_unstable_by(by_distance);
             }
             let mut near: SmallVec<[usize; 16]> = tracks
                 .into_iter()
                 .map(|(_, track)| self.of_track(track))
                 .collect();
             self.new_near(position, &mut near);
+            let Some(sensor) = self.sensors.get(scan.sensor).filter(|_| !near.is_empty()) else {
+                continue;
+            };
+            let rates = sensor.coverage.rates_at(&detection.reported);
             for hypothesis in near {
-                if let Some(benefit) = self.benefit(scan, detection, &self.hypotheses[hypothesis]) {
-                    pairs.push(GatedPair {
-                        detection: number,
-                        hypothesis,
-                        benefit,
-                    });
-                }
+                let benefit =
+                    self.benefit(scan.sensor, rates, detection, &self.hypotheses[hypothesis]);
+                pairs.extend(benefit.map(|benefit| GatedPair {
+                    detection: number,
+                    hypothesis,
+                    benefit,
+                }));
             }
         }
         pairs
     }
 
     /// Log-likelihood ratio of a pair, greater than 0; `None` if clutter or a new object explains the detection better.
+    /// `rates` are the vehicle's detection rates at the detection; `None` if its view is unknown.
     fn benefit(
         &self,
-        scan: &Scan<'_>,
+        sensor: SensorId,
+        rates: Option<&DetectionRates>,
         detection: &ScannedDetection<'_>,
         hypothesis: &Hypothesis,
     ) -> Option<f64> {
-        let (position, covariance) = hypothesis.information.mean()?;
+        let (position, covariance) = hypothesis.estimate?;
         let measurement = &detection.measurement;
         let offset = measurement.position - position;
         if offset.norm_squared() > self.config.gate_m.powi(2) {
@@ -328,12 +357,10 @@ impl<'a> Assignment<'a> {
         if distance_squared > self.config.gate() {
             return None;
         }
-        let sensor = self.sensors.get(scan.sensor)?;
-        let rates = sensor.coverage.rates_at(&detection.reported);
         let rate = |state| rates.map_or(UNKNOWN_RATE, |rates| rates.rate(state));
         let (detected, similarity) = match hypothesis.track.map(|track| &self.tracks[track]) {
             Some(track) => {
-                let state = track.history.state_of(scan.sensor);
+                let state = track.history.state_of(sensor);
                 (
                     track.existence.probability() * rate(state),
                     track.label_similarity(detection.object),
@@ -352,12 +379,8 @@ impl<'a> Assignment<'a> {
     fn open(&mut self, scan: &Scan<'_>, detection: &ScannedDetection<'_>) -> usize {
         let square = self.square(&detection.measurement.position);
         let number = self.hypotheses.len();
-        self.hypotheses.push(Hypothesis {
-            track: None,
-            prior: Information::NONE,
-            information: Information::NONE,
-            hits: SmallVec::new(),
-        });
+        self.hypotheses
+            .push(Hypothesis::new(None, Information::NONE));
         if scan.is_trusted() {
             self.new.entry(square).or_default().push(number);
         }
@@ -381,6 +404,12 @@ impl<'a> Assignment<'a> {
             }
         }
     }
+}
+
+/// Maximum number of tracks that are compared with each detection of a report. In a large report it is smaller, so that
+/// the time for a crowd grows with the number of its objects instead of the square.
+fn max_tracks_near(detections: usize) -> usize {
+    MAX_TRACKS_NEAR.min(MAX_PAIRS / detections.max(1)).max(1)
 }
 
 /// Greedy assignment of a large cluster: the best pair first.
@@ -413,5 +442,18 @@ impl Candidate for GatedPair {
     /// The benefit in units of 2⁻³⁰, at least one unit.
     fn benefit(&self) -> i64 {
         (self.benefit.min(1e6) * f64::from(1u32 << 30)) as i64 + 1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_report_compares_bounded_pairs() {
+        assert!((1..=300).all(|detections| max_tracks_near(detections) == MAX_TRACKS_NEAR));
+        for detections in 1..=MAX_PAIRS {
+            assert!(detections * max_tracks_near(detections) <= MAX_PAIRS);
+        }
     }
 }

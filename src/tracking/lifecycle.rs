@@ -98,12 +98,12 @@ fn near_pairs(
 fn may_be_one(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) -> bool {
     let distance_m = (other.state.position_at(now) - track.state.position_at(now)).norm();
     let are_vehicles = track.vehicle.is_some() && other.vehicle.is_some();
-    let are_unlike = track.label(config) != other.label(config) && distance_m >= MERGE_UNLIKE_M;
+    if distance_m >= MERGE_M || are_vehicles {
+        return false;
+    }
     let covariance = track.state.covariance_at(now) + other.state.covariance_at(now);
-    distance_m < MERGE_M
-        && !are_vehicles
-        && !are_unlike
-        && distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
+    let is_close = distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0;
+    is_close && (distance_m < MERGE_UNLIKE_M || track.label(config) == other.label(config))
 }
 
 /// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than a track can

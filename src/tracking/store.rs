@@ -22,8 +22,8 @@ pub(super) struct TrackStore {
     fastest_mps: f64,
     /// The track of each vehicle that reports its pose.
     of_vehicle: HashMap<SensorId, TrackIndex>,
-    /// Number of unconfirmed tracks by the vehicle that began them.
-    unconfirmed: HashMap<SensorId, usize>,
+    /// Number of sole tracks by the vehicle that began them: unconfirmed tracks, and tracks that only it has detected.
+    sole: HashMap<SensorId, usize>,
     max_tracks: usize,
     max_density: usize,
     gate_m: f64,
@@ -31,11 +31,7 @@ pub(super) struct TrackStore {
     pub(super) refused: u64,
 }
 
-/// Minimum side of a grid cell in metres. Trade-off: larger cells return more false candidates; smaller cells cost more
-/// look-ups.
-const MIN_CELL_M: f64 = 24.0;
-
-/// The store has this many shares. The unconfirmed tracks of one vehicle use at most one share.
+/// The store has this many shares. The sole tracks of one vehicle use at most one share.
 const SHARES: usize = 4;
 
 impl TrackStore {
@@ -48,11 +44,11 @@ impl TrackStore {
         } = *config;
         Self {
             tracks: Vec::new(),
-            grid: TrackGrid::new(gate_m * (MIN_CELL_M / gate_m).ceil()),
+            grid: TrackGrid::new(gate_m),
             indexed_at: Timestamp(0),
             fastest_mps: 0.0,
             of_vehicle: HashMap::new(),
-            unconfirmed: HashMap::new(),
+            sole: HashMap::new(),
             max_tracks,
             max_density,
             gate_m,
@@ -100,17 +96,15 @@ impl TrackStore {
 
     /// Adds a track unless the store is full.
     pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
-        let crowd = self.grid.crowd(&track.state.position, self.gate_m);
-        let of_spawner = track
-            .spawned_by
-            .and_then(|vehicle| self.unconfirmed.get(&vehicle));
+        let crowd = self.grid.crowd(&track.state.position);
+        let of_spawner = track.spawned_by.and_then(|vehicle| self.sole.get(&vehicle));
         let has_share = of_spawner.is_none_or(|tracks| *tracks < self.max_tracks.div_ceil(SHARES));
         if self.tracks.len() >= self.max_tracks || crowd >= self.max_density || !has_share {
             self.refused += 1;
             return None;
         }
         if let Some(vehicle) = track.spawned_by {
-            *self.unconfirmed.entry(vehicle).or_default() += 1;
+            *self.sole.entry(vehicle).or_default() += 1;
         }
         let index = TrackIndex(self.tracks.len() as u32);
         self.grid.insert(track.indexed(index, self.indexed_at));
@@ -133,8 +127,8 @@ impl TrackStore {
             self.of_vehicle
                 .extend(track.vehicle.map(|vehicle| (vehicle, index)));
             self.grid.insert(track.indexed(index, at));
-            if let Some(vehicle) = track.spawned_by.filter(|_| !track.is_confirmed()) {
-                *self.unconfirmed.entry(vehicle).or_default() += 1;
+            if let Some(vehicle) = track.spawned_by.filter(|_| track.is_sole()) {
+                *self.sole.entry(vehicle).or_default() += 1;
             }
         }
     }
@@ -218,7 +212,7 @@ impl TrackStore {
 
     fn clear_indexes(&mut self) {
         self.grid.clear();
-        self.unconfirmed.clear();
+        self.sole.clear();
         self.of_vehicle.clear();
     }
 }

@@ -620,6 +620,31 @@ fn object_density_is_bounded() {
     assert!(tracker.losses().refused >= 150);
 }
 
+/// A vehicle confirms ever more objects that only it detects, and another vehicle comes with a few.
+#[test]
+fn vehicle_fills_only_its_share() {
+    let config = TracksConfig {
+        max_tracks: 400,
+        ..TracksConfig::default()
+    };
+    let mut tracker = Tracker::new(config, ReputationConfig::default());
+    let mut round = TracksRound::default();
+    for frame in 0..120 {
+        // Enough frames of each group in turn to confirm it.
+        let first = frame / 8 * 100 % 800;
+        let invented = (first..first + 100).map(|n| car(n as f64 * 10.0, 0.0));
+        tracker.observe(report("mallory", frame, invented.collect()), at(frame));
+        if frame >= 100 {
+            let honest = (0..40).map(|n| car(n as f64 * 10.0, 500.0));
+            tracker.observe(report("euclid", frame, honest.collect()), at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let honest = round.objects.iter().filter(|object| object.y_m > 400.0);
+    assert_eq!(honest.count(), 40);
+    assert!(tracker.losses().refused > 0);
+}
+
 prop_compose! {
     fn object()(
         label in prop_oneof![Just("car"), Just("person")],

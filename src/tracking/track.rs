@@ -189,6 +189,15 @@ impl Track {
         !self.is_confirmed() && self.vehicle.is_none()
     }
 
+    /// True unless enough detections, and other vehicles than the one that began the track, confirm it.
+    pub(super) fn is_sole(&self) -> bool {
+        let mut detected = self
+            .history
+            .iter()
+            .filter(|history| history.last_hit.is_some());
+        !self.is_confirmed() || detected.nth(1).is_none()
+    }
+
     /// True if enough detections confirm the track.
     pub(super) fn is_confirmed(&self) -> bool {
         self.hits >= CONFIRMED_HITS

@@ -45,8 +45,8 @@ pub(super) struct InstantOutcome {
     pub(super) evidence: Vec<Evidence>,
 }
 
-/// Observation of one track by one vehicle.
-struct Observation {
+/// TrackObservation of one track by one vehicle.
+struct TrackObservation {
     track: TrackIndex,
     /// Number of the scan.
     scan: usize,
@@ -177,7 +177,7 @@ impl InstantUpdate<'_> {
     }
 
     /// All observations of the instant: detections, and misses of the tracks in view.
-    fn observations(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<Observation> {
+    fn observations(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<TrackObservation> {
         let mut detected: Vec<Vec<TrackIndex>> = vec![Vec::new(); scans.len()];
         let mut observations = Vec::new();
         for hypothesis in hypotheses {
@@ -193,7 +193,7 @@ impl InstantUpdate<'_> {
                 };
                 let place = scan.detections[detection].reported;
                 let state = history.state_of(scan.sensor);
-                observations.push(Observation {
+                observations.push(TrackObservation {
                     track,
                     scan: number,
                     detection: Some(detection),
@@ -218,7 +218,7 @@ impl InstantUpdate<'_> {
         number: usize,
         scan: &Scan<'_>,
         detected: &[TrackIndex],
-        observations: &mut Vec<Observation>,
+        observations: &mut Vec<TrackObservation>,
     ) {
         let Some(sensor) = self.sensors.get(scan.sensor) else {
             return;
@@ -246,7 +246,7 @@ impl InstantUpdate<'_> {
             if track.vehicle == Some(scan.sensor) || has_jumped || is_stale || !has_room {
                 return;
             }
-            observations.push(Observation {
+            observations.push(TrackObservation {
                 track: indexed.track,
                 scan: number,
                 detection: None,
@@ -356,7 +356,7 @@ impl InstantUpdate<'_> {
     /// Adds all observations to the existences, then updates rates, calibrations and judgements.
     fn weigh(
         &mut self,
-        observations: &[Observation],
+        observations: &[TrackObservation],
         scans: &[Scan<'_>],
         evidence: &mut Vec<Evidence>,
     ) {
@@ -427,7 +427,7 @@ impl InstantUpdate<'_> {
     }
 
     /// Updates rates and calibration with an observation and the existence after all observations of the instant.
-    fn learn(&mut self, observation: &Observation, scan: &Scan<'_>) {
+    fn learn(&mut self, observation: &TrackObservation, scan: &Scan<'_>) {
         let track = &mut self.tracks[observation.track];
         if track.vehicle.is_some() {
             return;
@@ -462,7 +462,7 @@ impl InstantUpdate<'_> {
     /// Judges a vehicle's statement about a track by the evidence of the other vehicles.
     fn judge(
         &mut self,
-        observation: &Observation,
+        observation: &TrackObservation,
         vehicle: SensorId,
         statement: ExistenceStatement,
         evidence: &mut Vec<Evidence>,

@@ -418,6 +418,9 @@ impl GatewayState {
         }
         if self.fits::<T>(&path, payload.len()) {
             let payload = self.setup.security.seal(&path, payload).into();
+            if matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts) {
+                self.inbox.record_published(&payload);
+            }
             self.send(&path, &payload, retention);
             self.expect_echo(topic);
         }

@@ -286,7 +286,7 @@ async fn missing_camera_settings_are_named() {
     let mut moving = with_camera("gauss");
     moving.pose.listen = Some("127.0.0.1:0".parse().unwrap());
     let (lost, page) = start(moving).await;
-    until_told(page, ["gauss", "", "no_pose"], "no pose is known").await;
+    until_told(page, ["gauss", "", "no_pose"], "no pose is available").await;
     let mut gone = with_camera("hertz");
     let path = directory.path().join("none");
     gone.camera.as_mut().unwrap().source = SourceConfig::Images {

@@ -23,7 +23,7 @@ pub enum ShedReason {
     LedgerThrottled,
     /// A node published its status more often than `mqtt.max_report_hz`; it was not decoded.
     StatusThrottled,
-    /// A vehicle and its parts reported more than 15,000 objects a second; the report was not
+    /// A vehicle and its parts reported more than 6000 objects a second; the report was not
     /// fused.
     ObjectsThrottled,
     /// A newer report of the same vehicle arrived before the fuser read this one.

@@ -12,17 +12,17 @@ use ecod::model::time::Timestamp;
 pub(super) struct ByteThrottle(Mutex<HashMap<Arc<str>, Timestamp>>);
 
 /// Bytes per second of one principal. A vehicle sends some tens of kilobytes.
-const BYTES_PER_S: u64 = 4 * 1024 * 1024;
+const BYTES_PER_S: u64 = 2 * 1024 * 1024;
 
 /// Bytes that are added for each packet, because small packets cost time as well.
 const PACKET_BYTES: usize = 1024;
 
 /// Factor on the rate for the leader, which sends maps, and for this machine without certificates,
 /// where a cell may run.
-const LARGE_SHARE: u64 = 8;
+const LARGE_SHARE: u64 = 16;
 
 /// Time of silence after which as much may be sent at once: two of the leader's largest maps, or
-/// eight of a vehicle's largest reports. More would occupy the leader's processor for several
+/// four of a vehicle's largest reports. More would occupy the leader's processor for several
 /// rounds.
 const BURST: Duration = Duration::from_millis(500);
 
@@ -79,11 +79,11 @@ mod tests {
         let long = mib(sent(false, 64 * 1024, 20));
         let short = mib(sent(false, 64 * 1024, 10));
         assert!(
-            (38.0..42.0).contains(&(long - short)),
-            "4 MiB a second: {long} {short}"
+            (19.0..21.0).contains(&(long - short)),
+            "2 MiB a second: {long} {short}"
         );
-        assert!((41.0..43.0).contains(&short), "and a burst: {short}");
+        assert!((20.5..21.5).contains(&short), "and a burst: {short}");
         assert!((320.0..345.0).contains(&mib(sent(true, 64 * 1024, 10))));
-        assert!(sent(false, 2, 10) < 2 * 60_000, "empty packets are few");
+        assert!(sent(false, 2, 10) < 2 * 30_000, "empty packets are few");
     }
 }

@@ -58,7 +58,7 @@ pub struct MqttConfig {
     /// are dropped and counted.
     pub inbox: usize,
     /// Maximum per second, and burst, of reports of one vehicle and kind (the largest count
-    /// sixfold), evidence shares of one candidate, or statuses of one node; more are counted and
+    /// twelvefold), evidence shares of one candidate, or statuses of one node; more are counted and
     /// not decoded. Default 100. Trade-off: a higher value lets one node take the processor time of
     /// others.
     pub max_report_hz: u32,
