@@ -443,12 +443,12 @@ impl Trial {
             let detected = self.events(Event::FrameDetected);
             let rate = detected.saturating_sub(std::mem::replace(&mut frames, detected)) as f64
                 / PROGRESS_PERIOD.as_secs_f64();
-            let map = self.vehicles.first().and_then(|vehicle| {
-                let map = vehicle.node.newest_map();
-                let objects = map.borrow().as_ref().map(|map| map.map.objects.len());
-                objects
-            });
-            let objects = map.map_or_else(
+            let map = self
+                .vehicles
+                .first()
+                .map(|vehicle| vehicle.node.newest_map());
+            let count = map.and_then(|map| map.borrow().as_ref().map(|map| map.map.objects.len()));
+            let objects = count.map_or_else(
                 || "no map yet".to_owned(),
                 |objects| format!("{objects} objects on the map"),
             );

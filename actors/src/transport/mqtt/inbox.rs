@@ -698,7 +698,7 @@ mod tests {
     #[test]
     fn own_round_is_not_decoded() {
         let counters = Arc::new(Counters::default());
-        let inbox = inbox((2, 100), &counters, |_| panic!("delivered"));
+        let inbox = inbox(2, 100, &counters, |_| panic!("delivered"));
         let topic = b"ecod/v1/lot/global_detections";
         let accept = |payload| accept(&inbox, topic, payload, Timestamp(1));
         let rounds: Vec<_> = (0..5_u8)
