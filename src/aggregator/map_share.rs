@@ -7,8 +7,8 @@ use crate::model::names::{Label, NodeName};
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
 /// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
-/// parts: about 330 objects with short labels. At ten maps per second a link carries them with
-/// 10 Mbit/s. Without this bound, one member's reports could make the map too large for the links
+/// parts: about 330 objects with short labels. Ten maps per second then take about
+/// 11 Mbit/s of a link. Without this bound, one member's reports could make the map too large for the links
 /// to carry once per round.
 const MAX_SOLE_BYTES: usize = 128 * 1024;
 

@@ -94,7 +94,8 @@ impl TrackStore {
             .map(|(index, track)| (TrackIndex(index as u32), track))
     }
 
-    /// Adds a track unless the store is full.
+    /// Adds a track unless the store, the place or the share of the vehicle that alone has detected
+    /// the object is full.
     pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
         let crowd = self.grid.crowd(&track.state.position);
         let of_spawner = track.spawned_by.and_then(|vehicle| self.sole.get(&vehicle));

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, ensure};
-use clap::Args;
+use clap::{ArgGroup, Args};
 use ecod::aggregator::FusionConfig;
 use ecod::model::names::{Label, NodeName};
 use ecod::perception::projection::{MountEstimate, ProjectionConfig};
@@ -34,11 +34,12 @@ use crate::camera::frame_source::capture::CaptureConfig;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::observe::dashboard::DEFAULT_ADDRESS;
-use crate::platform::installed;
+use crate::platform::{bounded_file, installed};
 use crate::telemetry::counters::Event;
 
 /// Arguments of `try`.
 #[derive(Debug, Default, Args)]
+#[command(group = ArgGroup::new("sources").multiple(true))]
 pub(super) struct TryArguments {
     /// Video files, images, directories of images, patterns such as frames/%04d.png, cameras of
     /// this machine (0 or /dev/video0) and addresses of network cameras (rtsp://, http://). Files
@@ -316,6 +317,8 @@ struct Trial {
 struct Vehicle {
     /// The configuration, as `--output` writes it.
     config: NodeConfig,
+    /// The text that `--output` has written.
+    saved: Option<String>,
     /// Address of its page.
     page: SocketAddr,
     /// `None` if height and tilt of the camera are stated or found.
@@ -376,7 +379,7 @@ impl Trial {
                 eprintln!("page of {}: http://{page}/", vehicle.name());
             }
             self.vehicles.push(vehicle);
-            self.save(index, |path| File::create_new(path))?;
+            self.save(index)?;
         }
         self.watch().await
     }
@@ -402,28 +405,36 @@ impl Trial {
         }
         Ok(Vehicle {
             config,
+            saved: None,
             page,
             watch,
             node,
         })
     }
 
-    /// Writes the configuration of a vehicle, if requested.
-    fn save(
-        &self,
-        index: usize,
-        open: impl FnOnce(&Path) -> std::io::Result<File>,
-    ) -> anyhow::Result<()> {
+    /// Writes the configuration of a vehicle, if requested. A file that has changed since the last
+    /// time stays as it is.
+    fn save(&mut self, index: usize) -> anyhow::Result<()> {
         let Some(path) = &self.output else {
             return Ok(());
         };
         let path = numbered(path, index);
-        let text = self.vehicles[index]
+        let vehicle = &mut self.vehicles[index];
+        let text = vehicle
             .config
             .to_toml_changed()
             .context("the configuration cannot be written as TOML")?;
-        let written = open(&path).and_then(|mut file| file.write_all(text.as_bytes()));
-        written.with_context(|| format!("cannot write {}", path.display()))
+        let written = match &vehicle.saved {
+            None => File::create_new(&path).and_then(|mut file| file.write_all(text.as_bytes())),
+            Some(saved) => {
+                let is_edited = bounded_file::read_text(&path)? != *saved;
+                ensure!(!is_edited, "{} was edited", path.display());
+                std::fs::write(&path, &text)
+            }
+        };
+        written.with_context(|| format!("cannot write {}", path.display()))?;
+        vehicle.saved = Some(text);
+        Ok(())
     }
 
     /// Reports progress, and starts a vehicle anew when its camera is found, until a node gives up.
@@ -481,6 +492,7 @@ impl Trial {
     async fn use_camera(&mut self, index: usize, estimate: &MountEstimate) -> anyhow::Result<()> {
         let Vehicle {
             mut config,
+            saved,
             page,
             node,
             ..
@@ -494,6 +506,7 @@ impl Trial {
         let node = node::start(running).await?;
         let vehicle = Vehicle {
             config,
+            saved,
             page,
             watch: None,
             node,
@@ -507,7 +520,10 @@ impl Trial {
             if pitch_deg < 0.0 { "up" } else { "down" }
         );
         self.vehicles.insert(index, vehicle);
-        self.save(index, |path| File::create(path))
+        if let Err(error) = self.save(index) {
+            eprintln!("the file keeps the guessed mount: {error:#}");
+        }
+        Ok(())
     }
 }
 

@@ -124,6 +124,7 @@ impl NodeBuilder {
             .unwrap_or_else(|| own_config.clone());
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
+        let report_queue = LatestReportQueue::new(config.mqtt.max_objects);
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
@@ -141,7 +142,7 @@ impl NodeBuilder {
             presence,
             vehicle,
             newest: Newest::default(),
-            report_queue: LatestReportQueue::default(),
+            report_queue,
             broker_address: watch::Sender::new(None),
             door: Door::default(),
             gossip_address: watch::Sender::new(None),

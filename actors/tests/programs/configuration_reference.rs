@@ -86,27 +86,47 @@ fn alternatives(schema: &Value) -> Vec<String> {
         .collect()
 }
 
-/// Loads [`COMPLETE`] with one key set to another value.
-fn load_with(key: &str, value: toml::Value) -> Result<NodeConfig, String> {
+/// Loads [`COMPLETE`] with other values of these keys.
+fn load_with(values: &[(&str, toml::Value)]) -> Result<NodeConfig, String> {
     let mut root: toml::Table = COMPLETE.parse().unwrap();
-    let (sections, field) = key.rsplit_once('.').unwrap_or(("", key));
-    let mut table = &mut root;
-    for section in sections.split('.').filter(|section| !section.is_empty()) {
-        table = table
-            .entry(section)
-            .or_insert_with(|| toml::Table::new().into())
-            .as_table_mut()
-            .unwrap();
+    for (key, value) in values {
+        let (sections, field) = key.rsplit_once('.').unwrap_or(("", key));
+        let mut table = &mut root;
+        for section in sections.split('.').filter(|section| !section.is_empty()) {
+            table = table
+                .entry(section)
+                .or_insert_with(|| toml::Table::new().into())
+                .as_table_mut()
+                .unwrap();
+        }
+        table.insert(field.to_owned(), value.clone());
     }
-    table.insert(field.to_owned(), value);
     let mut file = tempfile::NamedTempFile::new().unwrap();
     write!(file, "{root}").unwrap();
     NodeConfig::load(Some(file.path()), &BTreeMap::<(), ()>::new())
         .map_err(|error| error.to_string())
 }
 
-/// The bounds that the loader states when it refuses a number beyond them.
-fn range(key: &Key) -> Option<(String, String)> {
+/// The bounds that the loader states when it refuses this value of a key, beside a value of
+/// another.
+fn refused_range(
+    key: &str,
+    value: toml::Value,
+    other: Option<(&str, toml::Value)>,
+) -> Option<[String; 2]> {
+    let mut values = vec![(key, value)];
+    values.extend(other);
+    let error = load_with(&values).err()?;
+    let (place, bounds) = error.split_once("must be a number from ")?;
+    let (low, high) = bounds.split_once(" to ")?;
+    let high = high.split_whitespace().next()?.trim_end_matches([',', ';']);
+    place
+        .contains(&format!("`{key}`"))
+        .then(|| [low.to_owned(), high.to_owned()])
+}
+
+/// The lowest and the highest allowed number, or the key that bounds it.
+fn range(key: &Key, all: &[Key], defaults: &toml::Table) -> Option<[String; 2]> {
     let types = key.schema.get("type")?;
     let has_type = |name: &str| {
         types == name
@@ -124,18 +144,49 @@ fn range(key: &Key) -> Option<(String, String)> {
     } else {
         return None;
     };
-    let refused = beyond.into_iter().find_map(|value| {
-        let error = load_with(&key.name, value).err()?;
-        let (_, bounds) = error.split_once("must be a number from ")?;
-        let (low, high) = bounds.split_once(" to ")?;
-        let high = high.split_whitespace().next()?;
-        Some((low.to_owned(), high.trim_end_matches([',', ';']).to_owned()))
-    });
-    let of_type = || {
-        let bound = |name| Some(key.schema.get(name)?.as_number()?.to_string());
-        Some((bound("minimum")?, bound("maximum")?))
-    };
-    refused.or_else(of_type)
+    for value in beyond {
+        let Some(stated) = refused_range(&key.name, value.clone(), None) else {
+            continue;
+        };
+        let bounds = [0, 1].map(|end| {
+            let bounding = all.iter().find(|other| {
+                let Some(moved) = default_value(defaults, &other.name).and_then(lowered) else {
+                    return false;
+                };
+                let is_sibling = section_of(&other.name) == section_of(&key.name);
+                let range = || refused_range(&key.name, value.clone(), Some((&other.name, moved)));
+                is_sibling
+                    && other.name != key.name
+                    && range().is_some_and(|range| range[end] != stated[end])
+            });
+            match bounding {
+                Some(other) => format!("`{}`", field_of(&other.name)),
+                None => written(&stated[end]),
+            }
+        });
+        return Some(bounds);
+    }
+    let bound = |name| Some(written(&key.schema.get(name)?.as_number()?.to_string()));
+    Some([bound("minimum")?, bound("maximum")?])
+}
+
+/// A number that is a little smaller.
+fn lowered(value: &toml::Value) -> Option<toml::Value> {
+    match value {
+        toml::Value::Integer(number) if *number > 1 => Some((number - 1).into()),
+        toml::Value::Float(number) => Some((number * 0.9).into()),
+        _ => None,
+    }
+}
+
+/// The table of a key.
+fn section_of(key: &str) -> &str {
+    key.rsplit_once('.').map_or("", |(section, _)| section)
+}
+
+/// The name of a key in its table.
+fn field_of(key: &str) -> &str {
+    key.rsplit_once('.').map_or(key, |(_, field)| field)
 }
 
 /// A bound as the manual writes it: thousands are separated, and large or small powers of ten are
@@ -248,7 +299,13 @@ fn default_value<'a>(defaults: &'a toml::Table, key: &str) -> Option<&'a toml::V
 }
 
 /// One item of the list of a section, such as "- `beat_ms = 50` (5–10,000): Time between beats".
-fn item(key: &Key, section: &str, defaults: &toml::Table, definitions: &Value) -> String {
+fn item(
+    key: &Key,
+    all: &[Key],
+    section: &str,
+    defaults: &toml::Table,
+    definitions: &Value,
+) -> String {
     let description = key.schema.get("description").and_then(Value::as_str);
     let (meaning, stated) = meaning(description.unwrap_or_default());
     let meaning = without_unit(&key.name, &meaning);
@@ -271,8 +328,8 @@ fn item(key: &Key, section: &str, defaults: &toml::Table, definitions: &Value) -
     };
     let schema = Value::Object(key.schema.clone());
     let names = alternatives(referenced(&schema, definitions));
-    let allowed = match range(key) {
-        Some((low, high)) => format!(" ({}–{})", written(&low), written(&high)),
+    let allowed = match range(key, all, defaults) {
+        Some([low, high]) => format!(" ({low}–{high})"),
         None if !names.is_empty() => format!(" ({})", names.join(", ")),
         None => String::new(),
     };
@@ -289,7 +346,7 @@ fn list(section: &str, all: &[Key], defaults: &toml::Table, definitions: &Value)
             _ => top == section && top != key.name,
         };
         if belongs {
-            text += &item(key, section, defaults, definitions);
+            text += &item(key, all, section, defaults, definitions);
         }
     }
     text
@@ -301,7 +358,7 @@ fn documented_keys_match_code() {
     let definitions = &schema["$defs"];
     let mut all = Vec::new();
     keys(&schema, definitions, "", &mut all);
-    let complete = load_with("cell", "cell".into()).unwrap();
+    let complete = load_with(&[]).unwrap();
     let defaults: toml::Table = complete.to_toml().unwrap().parse().unwrap();
 
     let mut page = std::fs::read_to_string(manual()).unwrap();

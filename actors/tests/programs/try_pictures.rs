@@ -134,7 +134,9 @@ fn two_cameras_make_one_map() {
     let mut command = ecod_node();
     command
         .arg("try")
-        .args(&albums)
+        .arg(&albums[0])
+        .arg("--images")
+        .arg(&albums[1])
         .args(["--height", "1.4"])
         .args(["--dashboard", "127.0.0.1:0"])
         .arg("--save")

@@ -16,13 +16,13 @@ use crate::transport::mqtt::Delivery;
 /// at 10 Hz. More would take the processor time of other vehicles.
 const MAX_OBJECTS_HZ: u32 = 6_000;
 
-/// Maximum number of objects at once: the largest report. More would delay the round.
+/// Maximum number of objects at once, unless one report may have more. More would delay the round.
 const OBJECT_BURST: u32 = 1_024;
 
 /// Queue filled by the links' tasks and emptied by the fuser. It holds at most one report of each
 /// vehicle and kind, so that a flood from one vehicle does not delay other vehicles, and accepts at
 /// most `MAX_OBJECTS_HZ` objects per second of each vehicle.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct LatestReportQueue(Arc<Mutex<Waiting>>);
 
 #[derive(Debug)]
@@ -33,18 +33,6 @@ struct Waiting {
     reports: BTreeMap<u64, Delivery<QueuedReport>>,
     /// Place and capture time of each vehicle's report.
     places: BTreeMap<(NodeName, ReportKind), (u64, Timestamp)>,
-}
-
-impl Default for Waiting {
-    fn default() -> Self {
-        let objects = KeyedThrottle::new(OBJECT_BURST, Duration::from_secs(1) / MAX_OBJECTS_HZ);
-        Self {
-            objects,
-            next: 0,
-            reports: BTreeMap::new(),
-            places: BTreeMap::new(),
-        }
-    }
 }
 
 /// A report and its algorithm.
@@ -68,6 +56,17 @@ pub struct PushOutcome {
 }
 
 impl LatestReportQueue {
+    /// An empty queue for reports of up to `max_objects` objects.
+    pub fn new(max_objects: usize) -> Self {
+        let burst = OBJECT_BURST.max(u32::try_from(max_objects).unwrap_or(u32::MAX));
+        Self(Arc::new(Mutex::new(Waiting {
+            objects: KeyedThrottle::new(burst, Duration::from_secs(1) / MAX_OBJECTS_HZ),
+            next: 0,
+            reports: BTreeMap::new(),
+            places: BTreeMap::new(),
+        })))
+    }
+
     /// Adds a vehicle's report.
     pub fn push(&self, delivery: Delivery<QueuedReport>) -> PushOutcome {
         let QueuedReport { kind, report } = &delivery.message;
@@ -131,7 +130,7 @@ mod tests {
 
     #[test]
     fn latest_report_per_vehicle_waits() {
-        let queue = LatestReportQueue::default();
+        let queue = LatestReportQueue::new(1_024);
         let push = |node: &str, kind, seq| {
             let report = Arc::new(ObjectReport::new(
                 NodeName::new(node).unwrap(),
@@ -187,7 +186,7 @@ mod tests {
 
     #[test]
     fn vehicle_parts_share_object_budget() {
-        let queue = LatestReportQueue::default();
+        let queue = LatestReportQueue::new(1_024);
         let push = |node: &str, at_us: u64, objects: usize| {
             let object = PerceivedObject::new("car", 0.5, 0.0, 0.0);
             let report = ObjectReport {

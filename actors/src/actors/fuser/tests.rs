@@ -30,7 +30,7 @@ fn map(epoch: &Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
 fn standby() -> FuserState {
     FuserState::new(FuserArguments {
         aggregator: Aggregator::new_standby(FusionConfig::default(), Vec::new(), Timestamp(0)),
-        report_queue: LatestReportQueue::default(),
+        report_queue: LatestReportQueue::new(1_024),
         newest: None,
         recording: LogSender::default(),
         clock: CellClock::default(),

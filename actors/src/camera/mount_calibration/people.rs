@@ -21,8 +21,13 @@ pub(crate) struct PeopleWatch {
     label: Label,
     /// Usual size of people, or the size of the one person who walks.
     size: ObjectSize,
-    /// Boxes by frame, without distortion.
+    /// Boxes by frame, without distortion. Frames equal to an earlier one are omitted, because the
+    /// pictures of a looping source are no new evidence; so is an empty frame after another.
     frames: Vec<Vec<BoundingBox>>,
+    /// Number of frames, including the omitted ones.
+    watched: usize,
+    /// Number of boxes in `frames`.
+    boxes: usize,
     others: BTreeSet<Label>,
 }
 
@@ -36,6 +41,8 @@ impl PeopleWatch {
             label,
             size,
             frames: Vec::new(),
+            watched: 0,
+            boxes: 0,
             others: BTreeSet::new(),
         }
     }
@@ -62,19 +69,37 @@ impl PeopleWatch {
             person.label == self.label && projection.cut(person) == Cut::default()
         });
         self.lens.undistort(&mut detections);
-        let boxes = detections.iter().map(|person| person.bounding_box);
-        self.frames.push(boxes.collect());
+        let boxes: Vec<_> = detections
+            .iter()
+            .map(|person| person.bounding_box)
+            .collect();
+        self.watched += 1;
+        let is_new = if boxes.is_empty() {
+            self.frames.last().is_some_and(|last| !last.is_empty())
+        } else {
+            !self.frames.contains(&boxes)
+        };
+        if is_new {
+            self.boxes += boxes.len();
+            self.frames.push(boxes);
+        }
         Ok(())
     }
 
     /// Number of frames.
     pub(crate) fn frames(&self) -> usize {
-        self.frames.len()
+        self.watched
     }
 
-    /// Number of whole boxes of people.
+    /// Number of whole boxes of people in different frames.
     pub(crate) fn boxes(&self) -> usize {
-        self.frames.iter().map(Vec::len).sum()
+        self.boxes
+    }
+
+    /// Drops all frames.
+    pub(crate) fn clear(&mut self) {
+        self.frames.clear();
+        self.boxes = 0;
     }
 
     /// Labels of all other objects.

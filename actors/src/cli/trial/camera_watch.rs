@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ecod::model::detection::Detection;
 use ecod::model::names::Label;
-use ecod::perception::projection::{MIN_BOXES, MountEstimate};
+use ecod::perception::projection::{MIN_BOXES, MountEstimate, ProjectionConfig};
 
 use crate::camera::config::{CameraConfig, MountConfig};
 use crate::camera::detect::{CustomDetector, Detect, DetectError, DetectorConfig};
@@ -16,7 +16,7 @@ use crate::node;
 
 const PERSON: &str = "person";
 
-/// Boxes from which no further ones are collected: a fit uses fewer.
+/// Boxes after which the collection begins anew: a fit uses fewer.
 const MAX_BOXES: usize = 5000;
 
 /// Growth of the number of boxes after which a fit is tried again.
@@ -82,7 +82,11 @@ impl CameraWatch {
     /// Height and tilt of the camera, as soon as the collected people determine them; blocks for up
     /// to seconds when enough people have been added since the last fit.
     pub(super) fn find(&mut self) -> Option<MountEstimate> {
-        let people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
+        if people.boxes() >= MAX_BOXES {
+            people.clear();
+            self.next_fit = MIN_BOXES;
+        }
         if people.boxes() < self.next_fit {
             return None;
         }
@@ -102,9 +106,12 @@ impl CameraWatch {
     }
 }
 
-/// Sets the mount of a camera to an estimate, with its uncertainty.
+/// Sets the mount of a camera to an estimate. The errors are at least the usual ones, because the
+/// ground is not level everywhere and the camera may sway.
 pub(super) fn apply(estimate: &MountEstimate, camera: &mut CameraConfig) {
+    let usual = ProjectionConfig::default();
+    let tilt_sigma_rad = estimate.pitch_sigma_rad.max(estimate.roll_sigma_rad);
     camera.mount = MountConfig::rounded(&estimate.mount);
-    camera.projection.tilt_sigma_rad = estimate.pitch_sigma_rad;
-    camera.projection.height_sigma_m = estimate.height_sigma_m;
+    camera.projection.tilt_sigma_rad = tilt_sigma_rad.max(usual.tilt_sigma_rad);
+    camera.projection.height_sigma_m = estimate.height_sigma_m.max(usual.height_sigma_m);
 }
