@@ -89,7 +89,7 @@ eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 	cargo test --release --locked -p ecod --test core vote::generated:: -- --include-ignored --nocapture
 
 eval-tracks: setup ## [measure] tracking in generated traffic beside single vehicles and late fusion; writes table and drawings in docs/
-	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
+	cargo run --profile $(PROFILE) --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
 	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/results.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
 # DIR holds copies of the repositories that docs/evaluation.md names; the program names missing ones.
@@ -104,7 +104,7 @@ eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI
 	done; exit $$status
 
 eval-city: setup ## nine cells in generated traffic beside one aggregator over everything; the table goes into docs/results.md
-	cargo run --release --quiet --locked --example eval_city -- --write-table docs/results.md
+	cargo run --profile $(PROFILE) --quiet --locked --example eval_city -- --write-table docs/results.md
 
 eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI
