@@ -83,15 +83,15 @@ impl CameraWatch {
     /// to seconds when enough people have been added since the last fit.
     pub(super) fn find(&mut self) -> Option<MountEstimate> {
         let mut people = self.people.lock().unwrap_or_else(PoisonError::into_inner);
+        if people.boxes() < self.next_fit {
+            return None;
+        }
+        self.next_fit = MAX_BOXES.min((people.boxes() as f64 * RETRY_GROWTH) as usize);
+        let snapshot = people.clone();
         if people.boxes() >= MAX_BOXES {
             people.clear();
             self.next_fit = MIN_BOXES;
         }
-        if people.boxes() < self.next_fit {
-            return None;
-        }
-        self.next_fit = (people.boxes() as f64 * RETRY_GROWTH) as usize;
-        let snapshot = people.clone();
         drop(people);
         match snapshot.fit() {
             Ok(estimate) => Some(estimate).filter(|estimate| {

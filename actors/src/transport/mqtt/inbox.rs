@@ -108,6 +108,11 @@ impl Inbox {
         published.push_back(round.clone());
     }
 
+    /// True if these bytes, as received, are one of the latest rounds that this node published.
+    fn is_own_round(&self, sealed: &[u8]) -> bool {
+        self.published().iter().any(|round| round == sealed)
+    }
+
     fn published(&self) -> MutexGuard<'_, VecDeque<Bytes>> {
         self.published
             .lock()
@@ -177,9 +182,7 @@ impl Inbox {
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
-        if self.published().iter().any(|round| round == payload) {
-            return Ok(self.echo());
-        }
+        let sealed = payload;
         let payload = match &self.security.signing {
             // An empty payload deletes a retained message. It has no content to sign.
             Some(key) if !payload.is_empty() => key
@@ -189,6 +192,9 @@ impl Inbox {
         };
         let origin = |aggregator| self.origin(via, aggregator, topic, payload);
         let (message, origin) = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
+            Topic::GlobalDetections | Topic::GlobalVerdicts if self.is_own_round(sealed) => {
+                return Ok(self.echo());
+            }
             Topic::Detections(node) => {
                 return self.read_report(via, ReportKind::Detections, &node, payload, received_at);
             }
@@ -713,6 +719,13 @@ mod tests {
         assert_eq!(counters.events(Event::Echo), 4);
         assert_eq!(accept(&rounds[0]), PacketOutcome::Done);
         assert_eq!(counters.events(Event::Echo), 4, "the oldest is decoded");
+        let other = b"ecod/v1/lot/detections/mallory";
+        self::accept(&inbox, other, &rounds[4], Timestamp(1));
+        assert_eq!(
+            counters.events(Event::Echo),
+            4,
+            "a copy under another topic"
+        );
     }
 
     #[test]
