@@ -87,7 +87,7 @@ pub struct MembershipState {
     name: NodeName,
     myself: ActorRef<MembershipMessage>,
     /// Tasks that end with the actor.
-    _tasks: JoinSet<()>,
+    tasks: JoinSet<()>,
 }
 
 impl Actor for Membership {
@@ -199,7 +199,7 @@ impl Actor for Membership {
             has_own_address: false,
             name: own_name,
             myself,
-            _tasks: tasks,
+            tasks,
         })
     }
 
@@ -210,6 +210,8 @@ impl Actor for Membership {
     ) -> Result<(), ActorProcessingErr> {
         state.machine.leave(clock::now());
         state.carry_out();
+        // The tasks hold the socket: once the actor has ended, its address is free.
+        state.tasks.shutdown().await;
         Ok(())
     }
 

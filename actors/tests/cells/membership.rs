@@ -118,6 +118,13 @@ async fn five() -> Vec<Node> {
 }
 
 #[tokio::test]
+async fn stopped_membership_frees_its_address() {
+    let node = Node::start("euclid", config(&[])).await;
+    node.actor.stop_and_wait(None, Some(SOON)).await.unwrap();
+    std::net::UdpSocket::bind(node.address).unwrap();
+}
+
+#[tokio::test]
 async fn five_nodes_notice_death() {
     let mut nodes = five().await;
     let dead = nodes.remove(2);
