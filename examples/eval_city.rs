@@ -3,11 +3,11 @@
 //! `make eval-city`, or `cargo run --release --example eval_city -- [--seeds N] [--seconds S] [--roads N] [--write-table FILE]`
 
 use std::fmt::Write as _;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
+use ecod_lab::document::write_table;
 use ecod_lab::eval::tracks::TrackScores;
 use ecod_lab::town::{LinkConfig, TownResult, TownScores, run, town_traffic};
 use ecod_lab::traffic::generate;
@@ -108,26 +108,9 @@ fn main() -> anyhow::Result<()> {
     let table = table(&rows);
     print!("{table}");
     match options.table {
-        Some(path) => write_table(&path, &table).with_context(|| path.display().to_string()),
+        Some(path) => write_table(&path, "city", &table),
         None => Ok(()),
     }
-}
-
-/// Writes the table between its markers in a document.
-fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
-    const MARKS: [&str; 2] = [
-        "<!-- make eval-city -->\n",
-        "<!-- end of make eval-city -->",
-    ];
-    let text = fs::read_to_string(path)?;
-    let (head, rest) = text
-        .split_once(MARKS[0])
-        .context("has no mark for the table")?;
-    let (_, tail) = rest
-        .split_once(MARKS[1])
-        .context("has no mark for the table's end")?;
-    fs::write(path, format!("{head}{}{table}{}{tail}", MARKS[0], MARKS[1]))?;
-    Ok(())
 }
 
 type Figures = [f64; 7];

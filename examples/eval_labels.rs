@@ -27,6 +27,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 use ecod::model::names::{MAX_NAME_BYTES, NodeName};
+use ecod_lab::document::write_table;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -477,18 +478,6 @@ fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     } else {
         Ok(sets)
     }
-}
-
-fn write_table(path: &Path, kind: &str, table: &str) -> anyhow::Result<()> {
-    let begin = format!("<!-- {kind} table begin -->\n");
-    let end = format!("<!-- {kind} table end -->");
-    let text = fs::read_to_string(path)?;
-    let (before, rest) = text.split_once(&begin).context("no begin marker")?;
-    let (_, after) = rest.split_once(&end).context("no end marker")?;
-    Ok(fs::write(
-        path,
-        format!("{before}{begin}{table}{end}{after}"),
-    )?)
 }
 
 fn main() -> anyhow::Result<()> {

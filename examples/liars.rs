@@ -15,6 +15,7 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::ops::Range;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::leadership::ledger_resync::{LedgerResync, Merged};
@@ -27,6 +28,7 @@ use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{
     LedgerEntry, LedgerShare, LedgerSignature, ObjectReport, PerceivedObject, SCHEMA_VERSION,
 };
+use ecod_lab::document::write_table;
 use plotters::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -544,18 +546,6 @@ fn draw(path: &str, cases: &[Case]) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn write_table(path: &str, table: &str) -> Result<(), Box<dyn Error>> {
-    const BEGIN: &str = "<!-- liars table begin -->\n";
-    const END: &str = "<!-- liars table end -->";
-    let text = std::fs::read_to_string(path)?;
-    let (before, rest) = text.split_once(BEGIN).ok_or("no begin marker")?;
-    let (_, after) = rest.split_once(END).ok_or("no end marker")?;
-    Ok(std::fs::write(
-        path,
-        format!("{before}{BEGIN}{table}{END}{after}"),
-    )?)
-}
-
 fn main() -> Result<(), Box<dyn Error>> {
     let mut svg = None;
     let mut file = None;
@@ -567,7 +557,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         match key.as_str() {
             "--svg" => svg = Some(value),
             "--table" => file = Some(value),
-            "--write-table" => text = Some(value),
+            "--write-table" => text = Some(PathBuf::from(value)),
             "--seeds" => seeds = value.parse()?,
             _ => return Err(format!("unknown option {key}").into()),
         }
@@ -599,7 +589,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         std::fs::write(path, &table)?;
     }
     if let Some(path) = text {
-        write_table(&path, &shown)?;
+        write_table(&path, "liars", &shown)?;
     }
     if let Some(path) = svg {
         draw(&path, &cases)?;

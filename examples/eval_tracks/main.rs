@@ -27,6 +27,7 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
+use ecod_lab::document::write_table;
 use ecod_lab::eval::baselines::{LatestReports, NearestTracker, found, suppressed};
 use ecod_lab::eval::tracks::{
     AP_DISTANCES_M, ReliabilityBins, ReportedObject, TrackEvaluation, TrackScores, TrackTruth,
@@ -377,18 +378,6 @@ fn header() -> String {
     line(&mut names.clone()) + &line(&mut names.map(|_| "---".to_owned()))
 }
 
-fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
-    const BEGIN: &str = "<!-- track table begin -->\n";
-    const END: &str = "<!-- track table end -->";
-    let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    let (before, rest) = text.split_once(BEGIN).context("no begin marker")?;
-    let (_, after) = rest.split_once(END).context("no end marker")?;
-    Ok(fs::write(
-        path,
-        format!("{before}{BEGIN}{table}{END}{after}"),
-    )?)
-}
-
 fn main() -> anyhow::Result<()> {
     const { assert!(AP_DISTANCES_M.len() == 4) };
     let options = options()?;
@@ -453,7 +442,7 @@ fn main() -> anyhow::Result<()> {
         }
     }
     if let Some(path) = &options.table {
-        write_table(path, &table)?;
+        write_table(path, "track", &table)?;
     }
     if let Some(path) = &options.svg {
         plot::draw(path, &courses)?;

@@ -7,6 +7,7 @@
 //! testbed   recorded scenes: geometry, renderer, virtual-time trials   (uses eval)
 //! street    a street that moves: truth, network cameras, animation    (uses eval, testbed)
 //! drawing   page and font of drawings
+//! document  tables in the manual
 //! report    the page about a log, judged                              (uses eval)
 //! bench     load on a live cell                                       (starts ecod-node)
 //! demo      a whole cell on this machine                              (uses testbed and street, starts ecod-node)
@@ -19,6 +20,7 @@
 pub mod bench;
 pub mod cli;
 pub mod demo;
+pub mod document;
 mod drawing;
 pub mod eval;
 pub mod node_process;
