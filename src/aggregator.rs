@@ -16,6 +16,7 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
+mod conventions;
 mod expelled;
 mod map_share;
 mod neighbouring;
@@ -29,8 +30,10 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
+pub use conventions::{Misreading, MistakenHeading};
 pub use report_doubt::ReportDoubt;
 
+use conventions::Conventions;
 use expelled::Expelled;
 use map_share::limit_shares;
 use nalgebra::Point2;
@@ -103,6 +106,7 @@ pub struct Aggregator {
     /// first.
     overtaken: u64,
     placements: Placements,
+    conventions: Conventions,
     expelled: Expelled,
     neighbours: NeighbourView,
     vote: Option<Vote>,
@@ -146,6 +150,7 @@ impl Aggregator {
             tracks_open_cell,
             overtaken: 0,
             placements: Placements::default(),
+            conventions: Conventions::default(),
             expelled: Expelled::default(),
             neighbours: NeighbourView::default(),
             vote,
@@ -268,8 +273,11 @@ impl Aggregator {
                     let Placements { placed, misplaced } = &mut self.placements;
                     *if is_placed { placed } else { misplaced } += 1;
                 }
-                let report = &of_vehicle(report);
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
+                if let Admitted::InOrder(_) = admitted {
+                    self.conventions.observe(report, captured_at);
+                }
+                let report = &of_vehicle(report);
                 let tracks = self.tracks.as_mut();
                 let is_tracked = tracks.is_some_and(|tracks| {
                     tracks.observe_only(Arc::clone(report), captured_at, |object| {
@@ -339,8 +347,12 @@ impl Aggregator {
         let place = ReportDoubt::of_ranges(report)
             .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation))
             .or(sender.has_moved.then_some(ReportDoubt::Moves));
+        let misread = (kind == ReportKind::Detections)
+            .then(|| self.conventions.misreading(&report.node, now))
+            .flatten();
         place
             .into_iter()
+            .chain(misread.copied().map(ReportDoubt::Misread))
             .chain(sender.is_shared.then_some(ReportDoubt::SharedName))
     }
 

@@ -91,6 +91,8 @@ trouble_kinds! {
     UnknownLocation = "unknown_location", SHORT, "give all nodes the same `landmarks`: `ecod-node cell set`";
     /// Objects at impossible places.
     Misplaced = "misplaced", SHORT, "positions are in metres in the cell's frame: correct its pose, its program or the list of locations";
+    /// Objects that coincide with the objects of others after a turn or a mirror.
+    Orientation = "orientation", SHORT, "check its pose and axes: headings count counter-clockwise from east, y points north; degrees clockwise from north belong in `azimuth_deg`, `--azimuth` or `Pose.from_compass`";
     /// The node does not use the cell's description.
     Description = "description", UNTIL_SETTLED, "`ecod-node cell diff` shows the difference";
     /// Messages that cannot be read.

@@ -14,6 +14,7 @@ use ecod_interop::ros2::{Conversion, RosLog};
 use {
     ecod::model::geometry::Pose,
     ecod::perception::camera::Mount,
+    ecod::wire::WirePose,
     ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings},
 };
 
@@ -68,8 +69,11 @@ struct RosOptions {
     #[arg(long, value_name = "TOPIC", requires = "detections_2d")]
     camera_info: Option<String>,
     /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
-    #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
-    pose: Option<Pose>,
+    #[arg(long, value_name = "X,Y[,HEADING]", allow_hyphen_values = true, value_parser = place, group = "camera_pose")]
+    pose: Option<CameraPlace>,
+    /// Heading in degrees clockwise from north, in place of the third number of --pose.
+    #[arg(long, value_name = "DEG", allow_hyphen_values = true, value_parser = azimuth, requires = "pose")]
+    azimuth: Option<f64>,
     /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x
     /// ahead.
     #[arg(
@@ -97,8 +101,12 @@ struct RosOptions {
 #[cfg(feature = "dds")]
 impl RosOptions {
     fn settings(self) -> Result<(Settings, RosSettings), String> {
+        let pose = self
+            .pose
+            .map(|place| place.with(self.azimuth))
+            .transpose()?;
         let mut camera = RosCamera {
-            pose: self.pose,
+            pose,
             mount: Mount {
                 height_m: self.height_m,
                 pitch_rad: self.pitch_deg.to_radians(),
@@ -165,16 +173,53 @@ fn height(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "must be metres above the ground".to_owned())
 }
 
+/// Argument of --pose.
 #[cfg(feature = "dds")]
-fn pose(text: &str) -> Result<Pose, String> {
+#[derive(Clone, Copy)]
+struct CameraPlace {
+    x_m: f64,
+    y_m: f64,
+    /// Degrees counter-clockwise from east.
+    heading_deg: Option<f64>,
+}
+
+#[cfg(feature = "dds")]
+impl CameraPlace {
+    /// The pose, whose heading is the third number or the azimuth.
+    fn with(self, azimuth_deg: Option<f64>) -> Result<Pose, String> {
+        let Self { x_m, y_m, .. } = self;
+        match (self.heading_deg, azimuth_deg) {
+            (Some(heading_deg), None) => Ok(Pose::new(x_m, y_m, heading_deg.to_radians())),
+            (None, Some(azimuth_deg)) => Ok(WirePose::from_compass(x_m, y_m, azimuth_deg).into()),
+            _ => Err("--pose must be X,Y,HEADING, or X,Y with --azimuth DEG".to_owned()),
+        }
+    }
+}
+
+#[cfg(feature = "dds")]
+fn place(text: &str) -> Result<CameraPlace, String> {
     let numbers: Option<Vec<f64>> = text
         .split(',')
         .map(|part| finite(part.trim()).ok())
         .collect();
-    let Some(&[x_m, y_m, heading_deg]) = numbers.as_deref() else {
-        return Err("must be three numbers, such as 1.5,-2,90".to_owned());
+    let (x_m, y_m, heading_deg) = match numbers.as_deref() {
+        Some(&[x_m, y_m]) => (x_m, y_m, None),
+        Some(&[x_m, y_m, heading_deg]) => (x_m, y_m, Some(heading_deg)),
+        _ => return Err("must be three numbers, such as 1.5,-2,90".to_owned()),
     };
-    Ok(Pose::new(x_m, y_m, heading_deg.to_radians()))
+    Ok(CameraPlace {
+        x_m,
+        y_m,
+        heading_deg,
+    })
+}
+
+#[cfg(feature = "dds")]
+fn azimuth(text: &str) -> Result<f64, String> {
+    finite(text)
+        .ok()
+        .filter(|azimuth_deg| azimuth_deg.abs() <= 360.0)
+        .ok_or_else(|| "must be from -360 to 360".to_owned())
 }
 
 #[cfg(feature = "dds")]

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use nalgebra::Point2;
 
+use super::conventions::Misreading;
 use crate::model::geometry::Pose;
 use crate::wire::ObjectReport;
 
@@ -32,6 +33,9 @@ pub enum ReportDoubt {
     NoObjectAtLocation,
     /// The vehicle states that it does not move, but its pose changes.
     Moves,
+    /// The objects coincide with the objects of others after a turn or a mirror: a heading or a frame
+    /// follows another convention.
+    Misread(Misreading),
     /// Two senders report under the name: their numbers go back and forth.
     SharedName,
 }
@@ -55,6 +59,7 @@ impl fmt::Display for ReportDoubt {
             Self::FarObject { range_m } => write!(f, "an object of its report is {range_m:.0} m from its pose"),
             Self::NoObjectAtLocation => f.write_str("none of its objects is at a known location, or near one"),
             Self::Moves => f.write_str("it states `moving` = false, and its pose has moved by more than 25 m"),
+            Self::Misread(misreading) => misreading.fmt(f),
             Self::SharedName => {
                 f.write_str("two programs report under this name: the numbers `seq` of its reports go back and forth")
             }

@@ -355,6 +355,7 @@ impl FuserState {
                 ReportDoubt::FarObject { .. }
                 | ReportDoubt::NoObjectAtLocation
                 | ReportDoubt::Moves => TroubleKind::Misplaced,
+                ReportDoubt::Misread(_) => TroubleKind::Orientation,
                 ReportDoubt::SharedName => TroubleKind::NameTaken,
             };
             self.counters.troubles().record_about(

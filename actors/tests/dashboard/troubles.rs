@@ -1,19 +1,21 @@
 //! Troubles, as nodes name them.
 
+use std::f64::consts::FRAC_PI_2;
 use std::net::SocketAddr;
 #[cfg(feature = "camera")]
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ecod::aggregator::Algorithms;
 use ecod::model::names::NodeName;
-use ecod::wire::Role;
+use ecod::wire::{ObjectReport, PerceivedObject, Role, WirePose};
 #[cfg(feature = "camera")]
 use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::node::NodeHandle;
 #[cfg(feature = "camera")]
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::clock;
+use ecod_testkit::PATIENCE;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
@@ -109,6 +111,79 @@ async fn leader_troubles_reach_every_page() {
     })
     .await;
     stop([cav, edge]).await;
+}
+
+/// Objects that move on circles, in metres, at this time.
+fn walkers() -> impl Iterator<Item = [f64; 2]> {
+    let seconds = (clock::now().micros() % 1_000_000_000) as f64 * 1e-6;
+    let centres = [
+        [12.0, -6.0],
+        [17.0, 9.0],
+        [22.0, -1.0],
+        [27.0, 13.0],
+        [30.0, -9.0],
+        [14.0, 3.0],
+    ];
+    (0_u32..).zip(centres).map(move |(number, [x, y])| {
+        let (sin, cos) = (0.5 * seconds + f64::from(number)).sin_cos();
+        [x + 3.0 * cos, y + 3.0 * sin]
+    })
+}
+
+fn report_of_walkers(
+    node: &str,
+    pose: [f64; 3],
+    place: impl Fn([f64; 2]) -> [f64; 2],
+) -> ObjectReport {
+    let now = clock::now();
+    let [x_m, y_m, heading_rad] = pose;
+    ObjectReport {
+        pose: Some(WirePose::new(x_m, y_m, heading_rad)),
+        objects: walkers()
+            .map(place)
+            .map(|[x, y]| PerceivedObject::new("person", 0.9, x, y))
+            .collect(),
+        ..ObjectReport::new(node.parse().unwrap(), now.micros(), now)
+    }
+}
+
+/// A camera that looks west, whose azimuth of 270° was entered as its heading: its objects are turned by 90° about its
+/// position.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn compass_heading_names_angle() {
+    let (edge, page) = start(config("edge", Role::Edge, 2)).await;
+    let broker = edge.broker_address().unwrap();
+    let json = |report: ObjectReport| serde_json::to_string(&report).unwrap();
+    let right = send(broker, "euclid", move |_| {
+        json(report_of_walkers("euclid", [0.0, 0.0, 0.5], |place| place))
+    });
+    let turned = send(broker, "watson", move |_| {
+        let pose = [40.0, 10.0, -FRAC_PI_2];
+        json(report_of_walkers("watson", pose, |[x, y]| {
+            [40.0 - (y - 10.0), 10.0 + x - 40.0]
+        }))
+    });
+    // Three windows of ten seconds, and as long again.
+    let deadline = Instant::now() + 2 * PATIENCE;
+    let of_kind = || async {
+        let mut told = told(page).await;
+        told.retain(|[_, _, kind, _]| kind == "orientation");
+        told
+    };
+    let mut told = of_kind().await;
+    while told.is_empty() {
+        assert!(Instant::now() < deadline, "the heading is not named");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        told = of_kind().await;
+    }
+    let cause = "its objects agree with the objects of others after a turn by about -90° at its position, \
+        as if its heading were clockwise from north";
+    assert_eq!(
+        told,
+        [["edge", "watson", "orientation", cause].map(str::to_owned)]
+    );
+    drop((right, turned));
+    stop([edge]).await;
 }
 
 /// A vehicle whose reports the leader refuses reports this trouble, and is not ready.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from typing import Optional
 
@@ -66,14 +67,26 @@ def plan(cell: ecod.Cell, pose: ecod.Pose, speed_mps: float) -> None:
             say("BRAKE", f"no map for {MISSING_S} s")
 
 
+def pose_of(place: list[float], azimuth_deg: Optional[float]) -> ecod.Pose:
+    """The pose given by --pose and --azimuth."""
+    if len(place) != (3 if azimuth_deg is None else 2):
+        sys.exit("--pose takes X_M Y_M HEADING_DEG, or X_M Y_M with --azimuth DEG")
+    if azimuth_deg is not None:
+        return ecod.Pose.from_compass(place[0], place[1], azimuth_deg)
+    return ecod.Pose(place[0], place[1], math.radians(place[2]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pose", nargs=3, type=float, default=(0, 0, 0), metavar=("X_M", "Y_M", "HEADING_DEG"))
+    place = "metres east and north, and the heading in degrees counter-clockwise from east"
+    parser.add_argument("--pose", nargs="+", type=float, default=[0, 0, 0], metavar="NUMBER", help=place)
+    compass = "heading in degrees clockwise from north, in place of the third number of --pose"
+    parser.add_argument("--azimuth", type=float, metavar="DEG", help=compass)
     parser.add_argument("--speed", type=float, default=10.0, metavar="M_PER_S")
     given = parser.parse_args()
-    x_m, y_m, heading_deg = given.pose
+    pose = pose_of(given.pose, given.azimuth)
     with ecod.Cell() as cell:
-        plan(cell, ecod.Pose(x_m, y_m, math.radians(heading_deg)), given.speed)
+        plan(cell, pose, given.speed)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
-from typing import Any
+from typing import Any, Optional
 
 import numpy as np
 
@@ -31,12 +32,24 @@ def on_the_ground(homography: Any, boxes: Any, height: int, width: int) -> Any:
     return np.stack([x / w, y / w], axis=1)
 
 
+def pose_of(place: list[float], azimuth_deg: Optional[float]) -> ecod.Pose:
+    """The pose given by --pose and --azimuth."""
+    if len(place) != (3 if azimuth_deg is None else 2):
+        sys.exit("--pose takes X_M Y_M HEADING_DEG, or X_M Y_M with --azimuth DEG")
+    if azimuth_deg is not None:
+        return ecod.Pose.from_compass(place[0], place[1], azimuth_deg)
+    return ecod.Pose(place[0], place[1], math.radians(place[2]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default="0", help="number of a camera, a file or a URL")
     parser.add_argument("--weights", default="yolo11n.pt")
     parser.add_argument("--homography", required=True, metavar="FILE")
-    parser.add_argument("--pose", nargs=3, type=float, required=True, metavar=("X_M", "Y_M", "HEADING_DEG"))
+    place = "metres east and north, and the heading in degrees counter-clockwise from east"
+    parser.add_argument("--pose", nargs="+", type=float, required=True, metavar="NUMBER", help=place)
+    compass = "heading in degrees clockwise from north, in place of the third number of --pose"
+    parser.add_argument("--azimuth", type=float, metavar="DEG", help=compass)
     given = parser.parse_args()
 
     import cv2
@@ -45,7 +58,7 @@ def main() -> None:
 
     model = YOLO(given.weights)
     homography = np.loadtxt(given.homography).reshape(3, 3)
-    pose = ecod.Pose(given.pose[0], given.pose[1], math.radians(given.pose[2]))
+    pose = pose_of(given.pose, given.azimuth)
     camera: Any = cv2.VideoCapture(int(given.source) if given.source.isdigit() else given.source)
     with ecod.Cell(part="yolo") as cell:
         while True:

@@ -59,14 +59,21 @@ def feed(broker: str, *arguments: str, cell: str = "lot-1", lines: list[str]) ->
         return process.returncode, out + err
 
 
-def test_a_heading_is_given_by_degrees_of_either_kind() -> None:
-    pose_of: Callable[..., Any] = runpy.run_path(str(EXAMPLES / "feed_detections.py"))["pose_of"]
-    assert pose_of(None, None) is None
+@pytest.mark.parametrize("name", ["feed_detections.py", "yolo_loop.py", "brake_planner.py"])
+def test_a_heading_is_given_by_degrees_of_either_kind(name: str) -> None:
+    pose_of: Callable[..., Any] = runpy.run_path(str(EXAMPLES / name))["pose_of"]
     for south in (pose_of([1.0, 6.0, -90.0], None), pose_of([1.0, 6.0], 180.0)):
         assert (south.x_m, south.y_m, south.heading_rad) == pytest.approx((1.0, 6.0, -math.pi / 2))
-    for place, azimuth_deg in (([1.0, 6.0], None), ([1.0, 6.0, 90.0], 180.0), (None, 180.0)):
+    for place, azimuth_deg in (([1.0, 6.0], None), ([1.0, 6.0, 90.0], 180.0)):
         with pytest.raises(SystemExit, match="X_M Y_M with --azimuth DEG"):
             pose_of(place, azimuth_deg)
+
+
+def test_a_detector_may_run_without_a_pose() -> None:
+    pose_of: Callable[..., Any] = runpy.run_path(str(EXAMPLES / "feed_detections.py"))["pose_of"]
+    assert pose_of(None, None) is None
+    with pytest.raises(SystemExit, match="X_M Y_M with --azimuth DEG"):
+        pose_of(None, 180.0)
 
 
 def leads(edge: Server, cell_name: str, **settings: Any) -> None:
@@ -124,7 +131,7 @@ def test_a_detector_is_told_that_the_broker_refuses_or_is_gone(mosquitto: Callab
 def test_the_planner_brakes_for_an_object_ahead_and_without_maps(edge: Callable[..., Server], cell_name: str) -> None:
     node = edge(ECOD_FUSION__TRACKS__MODE="on")
     at = {"ECOD_BROKER": node.address, "ECOD_CELL": cell_name, "ECOD_NAME": "gauss"}
-    with example("brake_planner.py", "--pose", "0", "0", "0", "--speed", "10", **at) as planner:
+    with example("brake_planner.py", "--pose", "0", "0", "--azimuth", "90", "--speed", "10", **at) as planner:
         said: list[str] = []
         threading.Thread(target=lambda: said.extend(iter(planner.stdout.readline, "")), daemon=True).start()  # type: ignore[union-attr]
         wait_for(lambda: said[-1:] == ["GO: nothing is in the way\n"])
@@ -215,7 +222,7 @@ def test_yolo_reports_what_it_sees(edge: Callable[..., Server], cell_name: str, 
     node = edge(ECOD_FUSION__TRACKS__MODE="on")
     env = {"ECOD_BROKER": node.address, "ECOD_CELL": cell_name, "ECOD_NAME": "euclid", "PYTHONPATH": str(tmp_path)}
     files = ["--source", str(tmp_path / "video.avi"), "--homography", str(tmp_path / "ground.txt")]
-    with ecod.Cell(node.address, cell_name) as cell, example("yolo_loop.py", *files, "--pose", "1", "6", "-90", **env) as yolo:
+    with ecod.Cell(node.address, cell_name) as cell, example("yolo_loop.py", *files, "--pose", "1", "6", "--azimuth", "180", **env) as yolo:
 
         def are_there(map: ecod.GlobalMap) -> bool:
             assert yolo.poll() in (None, 0), yolo.communicate()

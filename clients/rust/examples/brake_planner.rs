@@ -3,6 +3,8 @@
 //!
 //! `cargo run -p ecod-client --example brake_planner -- X_M Y_M HEADING_DEG SPEED_MPS`
 //!
+//! The heading is counter-clockwise from east; `--azimuth DEG` in its place is clockwise from north.
+//!
 //! A real planner takes pose and speed from its localisation; here they are given. It prints a line
 //! when the decision changes. The cell is set by `ECOD_BROKER`, `ECOD_CELL` and `ECOD_NAME`.
 
@@ -21,14 +23,19 @@ const REACTION_S: f64 = 0.5;
 const DECELERATION_MPS2: f64 = 4.0;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let numbers: Vec<f64> = std::env::args()
-        .skip(1)
-        .map(|text| text.parse())
-        .collect::<Result<_, _>>()?;
-    let [x_m, y_m, heading_deg, speed_mps] = numbers[..] else {
-        return Err("usage: brake_planner X_M Y_M HEADING_DEG SPEED_MPS".into());
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let number = |text: &String| text.parse::<f64>();
+    let (pose, speed_mps) = match &arguments[..] {
+        [x, y, flag, azimuth, speed] if flag == "--azimuth" => {
+            let pose = WirePose::from_compass(number(x)?, number(y)?, number(azimuth)?);
+            (pose, number(speed)?)
+        }
+        [x, y, heading, speed] => {
+            let pose = WirePose::new(number(x)?, number(y)?, number(heading)?.to_radians());
+            (pose, number(speed)?)
+        }
+        _ => return Err("usage: brake_planner X_M Y_M HEADING_DEG|--azimuth DEG SPEED_MPS".into()),
     };
-    let pose = WirePose::new(x_m, y_m, heading_deg.to_radians());
     let stopping_m = speed_mps * REACTION_S + speed_mps.powi(2) / (2.0 * DECELERATION_MPS2);
     let cell = Cell::connect(Settings {
         part: "planner".into(),

@@ -715,7 +715,7 @@ fn planner_brakes_for_obstacle_or_silence() {
     let node = Node::start(config);
     let lidar = Cell::connect(node.settings("euclid")).unwrap();
     let mut planner = Command::new(example("brake_planner"))
-        .args(["0", "0", "0", "10"])
+        .args(["0", "0", "--azimuth", "90", "10"])
         .envs([
             ("ECOD_BROKER", &*node.door),
             ("ECOD_CELL", "lot-1"),

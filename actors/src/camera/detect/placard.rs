@@ -1,13 +1,13 @@
 //! Detector of placards: square QR codes that name a slot or a vehicle, read by zxing-cpp.
 //!
-//! Each pass reads the frame at a larger size. Codes that were read are painted over before the
-//! next pass, so that no code is read twice.
+//! Each pass reads the part of the frame that has contrast at a larger size. Codes that were read are
+//! painted over before the next pass, so that no code is read twice.
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::names::{Label, MAX_NAME_BYTES};
 use nalgebra::Point2;
-use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Scalar, Size, Vector};
+use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Rect, Scalar, Size, ToInputArray, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -112,6 +112,15 @@ impl PlacardDetector {
 
     /// The codes in a continuous gray image, which are painted over.
     pub(crate) fn codes(&self, gray: &mut Mat) -> Result<Vec<Code>, DetectError> {
+        let region = region_of_contrast(gray).map_err(|source| DetectError::OpenCv {
+            step: "measuring contrast",
+            source,
+        })?;
+        region.map_or_else(|| Ok(Vec::new()), |region| self.codes_in(gray, region))
+    }
+
+    /// The codes in a part of the image.
+    fn codes_in(&self, gray: &mut Mat, region: Rect) -> Result<Vec<Code>, DetectError> {
         let reader = zxingcpp::read()
             .formats(BarcodeFormat::QRCode)
             .max_number_of_symbols(self.config.max_codes)
@@ -121,7 +130,7 @@ impl PlacardDetector {
             .try_downscale(false);
         let mut codes: Vec<Code> = Vec::new();
         for &pass in &self.config.passes {
-            let found = read(&reader, gray, pass)?;
+            let found = read(&reader, gray, region, pass)?;
             for code in &found {
                 paint_over(gray, code).map_err(|source| DetectError::OpenCv {
                     step: "painting over a code",
@@ -138,6 +147,98 @@ impl PlacardDetector {
     }
 }
 
+/// Smallest difference of gray between paper and ink, after the noise of single pixels is averaged,
+/// of a code that is looked for.
+const MIN_CONTRAST: f64 = 32.0;
+
+/// Side in pixels of the square in which contrast is measured: edges of modules up to this size
+/// join to an area.
+const CONTRAST_PX: i32 = 9;
+
+/// Side in pixels of the smallest area of contrast. Single edges, such as horizons, are narrower.
+const AREA_PX: i32 = 16;
+
+/// Reduction from one scale to the next: codes with larger modules are areas at a smaller scale.
+const SCALE: i32 = 4;
+
+/// Pixels of the surroundings of a place on which its reading depends, and the steps at which the
+/// decoder divides columns and rows: a part that begins at a multiple is read like the whole image.
+const SURROUNDINGS_PX: i32 = 24;
+const COLUMN_STEP_PX: i32 = 8;
+const ROW_STEP_PX: i32 = 24;
+
+/// The part of the image that may contain codes: all areas with contrast. `None` without such an
+/// area.
+///
+/// Walls, floors and sky would take most of the time of the passes.
+fn region_of_contrast(gray: &Mat) -> opencv::Result<Option<Rect>> {
+    let whole = Rect::new(0, 0, gray.cols(), gray.rows());
+    if whole.width.min(whole.height) < 2 * AREA_PX {
+        return Ok(Some(whole));
+    }
+    let mut found = Rect::default();
+    let mut image = gray.try_clone()?;
+    let mut scale = 1;
+    while image.cols().min(image.rows()) >= 2 * AREA_PX {
+        let area = area_of_contrast(&image)?;
+        let area = Rect::new(
+            area.x * scale,
+            area.y * scale,
+            area.width * scale,
+            area.height * scale,
+        );
+        found |= area;
+        let mut smaller = Mat::default();
+        let factor = 1.0 / f64::from(SCALE);
+        let size = Size::default();
+        imgproc::resize(
+            &image,
+            &mut smaller,
+            size,
+            factor,
+            factor,
+            imgproc::INTER_AREA,
+        )?;
+        image = smaller;
+        scale *= SCALE;
+    }
+    if found.empty() {
+        return Ok(None);
+    }
+    let low = |at: i32, step: i32| (at - SURROUNDINGS_PX).max(0) / step * step;
+    let high = |at: i32, step: i32, end: i32| {
+        let aligned = (at + SURROUNDINGS_PX + step - 1) / step * step;
+        aligned.min(end)
+    };
+    let x = low(found.x, COLUMN_STEP_PX);
+    let y = low(found.y, ROW_STEP_PX);
+    let right = high(found.x + found.width, COLUMN_STEP_PX, whole.width);
+    let bottom = high(found.y + found.height, ROW_STEP_PX, whole.height);
+    Ok(Some(Rect::new(x, y, right - x, bottom - y)))
+}
+
+/// The smallest rectangle around all areas of contrast at one scale, in pixels; empty without such
+/// an area.
+fn area_of_contrast(image: &Mat) -> opencv::Result<Rect> {
+    let mut smooth = Mat::default();
+    let mut contrast = Mat::default();
+    let mut is_high = Mat::default();
+    let mut areas = Mat::default();
+    imgproc::blur_def(image, &mut smooth, Size::new(3, 3))?;
+    let square =
+        |side| imgproc::get_structuring_element_def(imgproc::MORPH_RECT, Size::new(side, side));
+    imgproc::morphology_ex_def(
+        &smooth,
+        &mut contrast,
+        imgproc::MORPH_GRADIENT,
+        &square(CONTRAST_PX)?,
+    )?;
+    let binary = imgproc::THRESH_BINARY;
+    imgproc::threshold(&contrast, &mut is_high, MIN_CONTRAST, 255.0, binary)?;
+    imgproc::morphology_ex_def(&is_high, &mut areas, imgproc::MORPH_OPEN, &square(AREA_PX)?)?;
+    imgproc::bounding_rect(&areas)
+}
+
 impl Detect for PlacardDetector {
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         let codes = self.codes(&mut gray(frame)?)?;
@@ -145,13 +246,20 @@ impl Detect for PlacardDetector {
     }
 }
 
-/// Codes in one enlargement of the image, with corners in pixels of the original.
-fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, DetectError> {
+/// Codes in one enlargement of a part of the image, with corners in pixels of the original.
+fn read(
+    reader: &BarcodeReader,
+    image: &Mat,
+    region: Rect,
+    pass: Pass,
+) -> Result<Vec<Code>, DetectError> {
     let opencv_error = |source| DetectError::OpenCv {
         step: "enlarging a frame",
         source,
     };
-    let enlarged = enlarge(image, pass).map_err(opencv_error)?;
+    let enlarged = Mat::roi(image, region)
+        .and_then(|part| enlarge(&part, pass))
+        .map_err(opencv_error)?;
     let pixels = enlarged.data_bytes().map_err(opencv_error)?;
     let view = ImageView::from_slice(pixels, enlarged.cols(), enlarged.rows(), ImageFormat::Lum);
     let codes = view
@@ -160,7 +268,7 @@ fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, De
     Ok(codes
         .iter()
         .filter(|code| code.is_valid())
-        .map(|code| Code::of(code, pass))
+        .map(|code| Code::of(code, region, pass))
         .collect())
 }
 
@@ -177,7 +285,7 @@ impl Code {
     /// zxing-cpp puts the centre of the first pixel at (0.5, 0.5) and rounds the outer corners of
     /// the code to whole numbers; enlarging by OpenCV keeps the edges of the image in place, so
     /// both coordinates only scale.
-    fn of(barcode: &Barcode, pass: Pass) -> Self {
+    fn of(barcode: &Barcode, region: Rect, pass: Pass) -> Self {
         let position = barcode.position();
         let corners = [
             position.top_left,
@@ -187,8 +295,8 @@ impl Code {
         ]
         .map(|c| {
             Point2::new(
-                f64::from(c.x) / pass.stretch_x,
-                f64::from(c.y) / pass.stretch_y,
+                f64::from(region.x) + f64::from(c.x) / pass.stretch_x,
+                f64::from(region.y) + f64::from(c.y) / pass.stretch_y,
             )
         });
         let version: u8 = barcode.extra_with_key("Version").parse().unwrap_or(1);
@@ -251,7 +359,7 @@ fn gray(frame: &CameraFrame) -> Result<Mat, DetectError> {
     })
 }
 
-fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
+fn enlarge(image: &(impl MatTraitConst + ToInputArray), pass: Pass) -> opencv::Result<Mat> {
     if pass.stretch_x == 1.0 && pass.stretch_y == 1.0 {
         return image.try_clone();
     }

@@ -138,6 +138,8 @@ struct RenderView<'a> {
     intrinsics: &'a Intrinsics,
     placard: &'a Placard,
     pose: &'a Pose,
+    /// Unit vector of the heading.
+    ahead: Vector2<f64>,
     to_level: Matrix3<f64>,
     /// Top and bottom of all cards, in metres above the camera.
     top_m: f64,
@@ -171,6 +173,7 @@ impl<'a> RenderView<'a> {
             intrinsics,
             placard,
             pose,
+            ahead: Vector2::new(pose.heading_rad.cos(), pose.heading_rad.sin()),
             to_level: mount.to_level(),
             top_m,
             bottom_m,
@@ -214,8 +217,8 @@ impl<'a> RenderView<'a> {
 
     /// The light along a ray of the level frame that may hit `faces`.
     fn light<'f>(&self, ray: &Vector3<f64>, faces: impl Iterator<Item = &'f Face<'f>>) -> Light {
-        let (sin, cos) = self.pose.heading_rad.sin_cos();
-        let sight = Vector2::new(cos * ray.x - sin * ray.y, sin * ray.x + cos * ray.y);
+        let ahead = self.ahead;
+        let sight = ahead * ray.x + Vector2::new(-ahead.y, ahead.x) * ray.y;
         let mut nearest: Option<Meeting> = None;
         for face in faces {
             // Of two cards at one place, the later hides the earlier: a plate its sign.

@@ -94,6 +94,45 @@ impl Scene {
     }
 }
 
+/// Codes at several places and distances are read alike in the part of the image with contrast and in the whole image.
+#[test]
+fn plain_surroundings_change_no_code() {
+    let whole = Rect::new(0, 0, 640, 480);
+    for (range_in, bearing_deg, yaw_deg) in [
+        (12.0, 0.0, 0.0),
+        (20.0, -14.0, 20.0),
+        (26.0, 18.0, -30.0),
+        (34.0, 5.0, 0.0),
+        (16.0, -24.0, 45.0),
+    ] {
+        let mut scene = Scene::empty();
+        let code = code("ABCD123");
+        scene.put(&code, range_in, bearing_deg, yaw_deg);
+        let image = gray(&scene.seen()).unwrap();
+        let region = region_of_contrast(&image).unwrap().unwrap();
+        assert!(region.area() < whole.area() / 2, "{region:?}");
+        let placed = |region: Rect| -> Vec<_> {
+            let codes = PlacardDetector::new(PlacardConfig::default())
+                .codes_in(&mut image.try_clone().unwrap(), region)
+                .unwrap();
+            codes
+                .into_iter()
+                .map(|code| (code.text, code.corners))
+                .collect()
+        };
+        assert_eq!(
+            placed(region),
+            placed(whole),
+            "{range_in} {bearing_deg} {yaw_deg}"
+        );
+    }
+    assert!(
+        region_of_contrast(&gray(&Scene::empty().seen()).unwrap())
+            .unwrap()
+            .is_none()
+    );
+}
+
 /// Side of a module in the flat drawing, in pixels.
 const MODULE: f64 = 16.0;
 
