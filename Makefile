@@ -59,10 +59,12 @@ demo-picture: setup ## the recording in README.md: the live page while the edge 
 	packaging/page-recording $(PROGRAMS) docs/page.webp
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
-	cargo build --profile $(PROFILE) --locked --bin ecod-lab
+	cargo build --profile $(PROFILE) --locked --bin ecod-lab --example testbed_table
 	for setup in 1 2; do $(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
 	    --at-least 99.5 --occupied-at-least 99 --output target/testbed-setup$$setup.json || exit; done
 	$(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --output target/testbed-vote.json
+	$(PROGRAMS)/examples/testbed_table "parking lots, setup 1=target/testbed-setup1.json" "parking lots, setup 2=target/testbed-setup2.json" \
+	    intersection=target/testbed-vote.json $(if $(filter 200,$(VERDICTS)),--write-table docs/results.md)
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 # OPTIONS="--seconds 20" takes other options of packaging/compare.
@@ -78,7 +80,7 @@ eval-labels: setup ## accuracy of VOTE on label sets; the tables go into docs/re
 results-check: eval-labels ## fails if the tables of label sets in docs/results.md differ from the measured ones
 	git diff --exit-code docs/results.md
 
-tables-check: eval-labels eval-tracks eval-city liars ## measure all tables and drawings of docs/ that do not depend on the machine; fails if one changes
+tables-check: eval-labels eval-tracks eval-city liars testbed ## measure all tables and drawings of docs/ that do not depend on the machine; fails if one changes
 	git diff --exit-code docs
 
 compare-labels: PACKAGES += python3-venv

@@ -108,26 +108,27 @@ impl Conventions {
 
     /// Compares a report with the simultaneous reports of the nearest other vehicles.
     fn compare(&mut self, report: &ObjectReport, at: Timestamp) {
-        let own = PlacedReport::of(report);
         let vehicle = report.node.vehicle();
-        let distance_m = |other: &PlacedReport| {
-            let poses = own.pose.zip(other.pose);
+        let distance_m = |other: &ObjectReport| {
+            let poses = report.pose.zip(other.pose);
             poses.map_or(f64::INFINITY, |(own, other)| {
-                nalgebra::distance(&own.position, &other.position)
+                (own.x_m - other.x_m).hypot(own.y_m - other.y_m)
             })
         };
-        let mut others: Vec<PlacedReport> = self
+        let mut simultaneous: Vec<&ObjectReport> = self
             .observers
             .iter()
             .filter(|(name, other)| {
                 let apart_us = other.captured_at.micros_from(at).unsigned_abs();
                 apart_us <= SIMULTANEOUS.as_micros() as u64 && name.vehicle() != vehicle
             })
-            .map(|(_, other)| PlacedReport::of(&other.latest))
+            .map(|(_, other)| &*other.latest)
             .filter(|other| !other.objects.is_empty())
             .collect();
-        others.sort_by(|one, other| distance_m(one).total_cmp(&distance_m(other)));
-        others.truncate(MAX_OTHERS);
+        simultaneous.sort_by(|one, other| distance_m(one).total_cmp(&distance_m(other)));
+        let nearest = simultaneous.into_iter().take(MAX_OTHERS);
+        let others: Vec<_> = nearest.map(PlacedReport::of).collect();
+        let own = PlacedReport::of(report);
         let Some(observer) = self
             .observers
             .get_mut(&report.node)
