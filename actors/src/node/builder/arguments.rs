@@ -414,6 +414,7 @@ impl NodeBuilder {
                 .map(|camera| camera.name.clone())
                 .collect(),
             floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
+            origin: self.config.origin,
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::model::names::{Label, LandmarkId, NodeName};
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
@@ -71,6 +72,9 @@ pub struct NodeFacts {
     /// The image under the map, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub floor_plan: Option<FloorPlanFacts>,
+    /// Place of the cell's frame on Earth; absent without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub origin: Option<GeographicOrigin>,
     /// Version of the software.
     pub version: &'static str,
     /// Start of the node in Unix microseconds by its clock.
@@ -91,10 +95,12 @@ impl NodeSources {
     /// The current facts about the node.
     pub(crate) fn node_facts(&self) -> NodeFacts {
         let credentials = self.vitals.security.credentials.as_ref();
+        let shared = self.vitals.shared.borrow();
         NodeFacts {
             certificate_ends_us: credentials
                 .map(|credentials| credentials.current().identity.expires()),
-            round_period_s: self.vitals.shared.borrow().round_period_s,
+            round_period_s: shared.round_period_s,
+            origin: shared.origin,
             ..self.node.clone()
         }
     }
