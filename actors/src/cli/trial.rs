@@ -379,6 +379,7 @@ impl Trial {
                 eprintln!("page of {}: http://{page}/", vehicle.name());
             }
             self.vehicles.push(vehicle);
+            self.share_pictures();
             self.save(index)?;
         }
         self.watch().await
@@ -410,6 +411,18 @@ impl Trial {
             watch,
             node,
         })
+    }
+
+    /// Shows the pictures of all vehicles on the page of each.
+    fn share_pictures(&self) {
+        for vehicle in &self.vehicles {
+            let others = self
+                .vehicles
+                .iter()
+                .filter(|other| other.page != vehicle.page)
+                .flat_map(|other| other.node.cameras());
+            vehicle.node.show_cameras(others.cloned().collect());
+        }
     }
 
     /// Writes the configuration of a vehicle, if requested. A file that has changed since the last
@@ -520,6 +533,7 @@ impl Trial {
             if pitch_deg < 0.0 { "up" } else { "down" }
         );
         self.vehicles.insert(index, vehicle);
+        self.share_pictures();
         if let Err(error) = self.save(index) {
             eprintln!("the file keeps the guessed mount: {error:#}");
         }
