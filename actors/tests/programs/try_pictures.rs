@@ -204,6 +204,22 @@ fn two_cameras_make_one_map() {
             printed.status.success() && text.contains(images) && text.contains("height_m = 1.4"),
             "{text}"
         );
+        let template = fs::read_to_string(&path).unwrap();
+        for guess in ["camera.optics", "camera.mount.pitch_deg", "pose"] {
+            assert!(template.contains(&format!("# - {guess}: ")), "{template}");
+        }
+        assert!(
+            !template.contains("# - camera.mount.height_m"),
+            "{template}"
+        );
+        for pair in template.lines().collect::<Vec<_>>().windows(2) {
+            let is_stated = !pair[1].is_empty() && !pair[1].starts_with('#');
+            assert!(
+                !is_stated || pair[0].starts_with("# "),
+                "{} has no comment in:\n{template}",
+                pair[1]
+            );
+        }
     }
 }
 
