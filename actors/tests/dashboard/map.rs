@@ -578,7 +578,7 @@ async fn floor_plan_lies_under_map() {
     let answer = get(page, "/api/floor_plan").await;
     assert_eq!(
         (answer.status, answer.header("content-type")),
-        (200, Some("image/png"))
+        (200, Some("image/jpeg"))
     );
     let _vehicles = watch(node.broker_address().unwrap());
     let browser = Browser::start().await;
