@@ -75,7 +75,8 @@ export class CameraView {
     text(byId("camera-title"), reporter === null ? "Cameras" : "Camera");
     // The node measures the mounts of its own cameras only, which are the first.
     const own = reporter === null ? undefined : this.#node.cameras[this.#reporters.indexOf(reporter)];
-    byId("mount").disabled = this.#node.cameras.length === 0 || (reporter !== null && own === undefined);
+    const isForeign = this.#node.cameras.length === 0 || (reporter !== null && own === undefined);
+    Object.assign(byId("mount"), { disabled: isForeign, title: isForeign ? "On the page of the camera's own node" : "" });
     this.#follow();
     this.onCamera(own);
     this.onLight(null);
