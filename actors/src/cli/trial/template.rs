@@ -29,7 +29,7 @@ pub(super) struct Template {
 }
 
 impl Guess {
-    /// The key, what was guessed, and how to measure it.
+    /// The key, its guessed value, and the way to measure it.
     fn advice(self, config: &NodeConfig) -> String {
         let camera = config.camera.as_ref();
         let mount = camera.map(|camera| camera.mount).unwrap_or_default();

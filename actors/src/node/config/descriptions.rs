@@ -74,8 +74,8 @@ impl<'a> TableDescriptions<'a> {
     }
 }
 
-/// Adds the schemas of a table's keys: of the schema itself, of what it refers to, and of the
-/// alternative that the table chooses.
+/// Adds the schemas of a table's keys: of the schema itself, of the schema to which it refers, and of
+/// the alternative that the table chooses.
 fn collect<'a>(
     schema: &'a Schema,
     definitions: &'a Schema,
@@ -113,15 +113,23 @@ fn is_chosen(alternative: &Schema, table: &Table) -> bool {
 /// The sentences of a text. They end with a full stop before a space and a capital letter or a code
 /// span.
 pub fn sentences(text: &str) -> Vec<String> {
-    let mut found = Vec::new();
-    let mut start = 0;
-    for (position, _) in text.match_indices(". ") {
-        let next = text[position + 2..].chars().next();
-        if next.is_some_and(|letter| letter.is_uppercase() || letter == '`') {
-            found.push(text[start..=position].to_owned());
-            start = position + 2;
+    let mut found: Vec<String> = Vec::new();
+    for part in text.split(". ") {
+        let mut letters = part.chars();
+        let begins = letters
+            .next()
+            .is_some_and(|letter| letter.is_uppercase() || letter == '`');
+        match found.last_mut() {
+            Some(before) if !begins => {
+                before.push_str(". ");
+                before.push_str(part);
+            }
+            Some(before) => {
+                before.push('.');
+                found.push(part.to_owned());
+            }
+            None => found.push(part.to_owned()),
         }
     }
-    found.push(text[start..].to_owned());
     found
 }
