@@ -362,7 +362,7 @@ async fn wall_shows_all_cameras() {
     let wall = "[...document.querySelectorAll('#camera-wall figure')].map((it) => [it.querySelector('figcaption button').textContent, \
         ...[...it.querySelectorAll('.boxes button')].map((box) => box.textContent)].join(' ')).join()";
     let all = "euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %,gauss horse 87 %";
-    browser.until(&format!("{} === '{all}'", wall)).await;
+    browser.until(&format!("{wall} === '{all}'")).await;
     let is_drawn = "[...document.querySelectorAll('#camera-wall canvas')].every((it) => it.getContext('2d').getImageData(200, 200, 1, 1).data[3] === 255)";
     browser.until(is_drawn).await;
     let names =
@@ -463,8 +463,7 @@ async fn wall_shows_all_cameras() {
         .await;
     browser
         .until(&format!(
-            "{} === 'euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %'",
-            wall
+            "{wall} === 'euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %'"
         ))
         .await;
     browser.quit_without_complaints().await;
