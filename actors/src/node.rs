@@ -59,7 +59,7 @@ pub use slots::{ActorKind, ActorSlots};
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
-use crate::observe::dashboard::LiveState;
+use crate::observe::dashboard::{LiveState, ShownCamera};
 use crate::observe::readiness::{SharedFacts, Vitals};
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
@@ -147,6 +147,8 @@ pub struct NodeHandle {
     frames: Arc<FrameCounters>,
     live_state: Arc<LiveState>,
     shared: watch::Receiver<SharedFacts>,
+    cameras: Vec<ShownCamera>,
+    further_cameras: watch::Sender<Vec<ShownCamera>>,
     name: NodeName,
 }
 
@@ -181,6 +183,8 @@ async fn start_with(
         let checked = credentials.check_rights(config.role, config.election.priority);
         checked.map_err(|error| NodeError::Failed(error.to_string()))?;
     }
+    let cameras = vehicle.shown_cameras.clone();
+    let further_cameras = vehicle.further_cameras.clone();
     let (failed, failure) = watch::channel(None);
     let held = HeldDescription::at_start(&config)?;
     let floor_plan = config
@@ -222,6 +226,8 @@ async fn start_with(
         frames,
         live_state,
         shared,
+        cameras,
+        further_cameras,
         name,
     })
 }
@@ -303,6 +309,17 @@ impl NodeHandle {
             leader.as_ref(),
             self.counters.troubles().present(),
         )
+    }
+
+    /// The node's cameras whose pictures its page shows.
+    pub fn cameras(&self) -> &[ShownCamera] {
+        &self.cameras
+    }
+
+    /// Shows the pictures of these cameras on the node's page, too. They belong to other nodes of
+    /// this process, and replace those shown before.
+    pub fn show_cameras(&self, further: Vec<ShownCamera>) {
+        self.further_cameras.send_replace(further);
     }
 
     /// Makes the supervisor report the node's state to a service manager until it ends.

@@ -26,7 +26,6 @@ pub struct CameraConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Source of the camera's frames: a device, a stream or files.
-    #[schemars(with = "serde_json::Value")]
     pub source: SourceConfig,
     /// Stall timeout and retries of the source.
     #[serde(default)]
@@ -39,7 +38,6 @@ pub struct CameraConfig {
     #[serde(default)]
     pub mount: MountConfig,
     /// Detector of objects in frames.
-    #[schemars(with = "serde_json::Value")]
     pub detector: DetectorConfig,
     /// Projection of detections into the world.
     #[serde(default)]

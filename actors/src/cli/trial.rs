@@ -3,9 +3,9 @@
 
 mod camera_watch;
 mod picture_source;
+mod template;
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -23,6 +23,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use self::camera_watch::CameraWatch;
 use self::picture_source::PictureSource;
+use self::template::{Guess, Template};
 use super::Failure;
 use super::run::{input_ended, ip_and_port, run_to_end};
 use crate::camera::config::{CameraConfig, MountConfig, OpticsConfig};
@@ -34,7 +35,7 @@ use crate::camera::frame_source::capture::CaptureConfig;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::observe::dashboard::DEFAULT_ADDRESS;
-use crate::platform::{bounded_file, installed};
+use crate::platform::installed;
 use crate::telemetry::counters::Event;
 
 /// Arguments of `try`.
@@ -106,17 +107,38 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
     let trial = Trial {
-        output: arguments.output.clone(),
-        finds_cameras: arguments.finds_cameras(),
+        templates: arguments.templates(configs.len()).map_err(Failure::usage)?,
+        guesses: arguments.guesses(),
         vehicles: Vec::new(),
     };
     run_to_end(trial.serve(configs, arguments.stop_at_eof))
 }
 
 impl TryArguments {
-    /// True if height and tilt of the cameras are guesses, which people who walk can replace.
-    fn finds_cameras(&self) -> bool {
-        !self.sources().is_empty() && self.height.is_none() && self.pitch.is_none()
+    /// The guesses about each vehicle. The street's vehicles have configurations.
+    fn guesses(&self) -> Vec<Guess> {
+        let stated = [
+            (Guess::FieldOfView, self.fov.is_some()),
+            (Guess::Height, self.height.is_some()),
+            (Guess::Tilt, self.pitch.is_some()),
+            (Guess::Position, false),
+        ];
+        let has_sources = !self.sources().is_empty();
+        let guesses = stated.into_iter().filter(|(_, is_stated)| !is_stated);
+        guesses
+            .map(|(guess, _)| guess)
+            .filter(|_| has_sources)
+            .collect()
+    }
+
+    /// The files for the configurations of this number of vehicles, if they are to be written.
+    fn templates(&self, count: usize) -> anyhow::Result<Vec<Template>> {
+        let Some(path) = &self.output else {
+            return Ok(Vec::new());
+        };
+        (0..count)
+            .map(|index| Template::new(numbered(path, index)))
+            .collect()
     }
 
     /// All sources: those by position, then those by flags of the kind.
@@ -211,34 +233,12 @@ impl TryArguments {
             configs = street().map_err(Failure::usage)?;
         }
         for (index, config) in configs.iter_mut().enumerate() {
-            if let Some(path) = &self.output {
-                check_absent(&numbered(path, index)).map_err(Failure::usage)?;
-            }
             isolate(config);
             config.dashboard.listen = self.dashboard.filter(|_| index == 0);
             config.validate().map_err(Failure::usage)?;
         }
         Ok(configs)
     }
-}
-
-/// Checks that a file can be made.
-fn check_absent(path: &Path) -> anyhow::Result<()> {
-    let directory = path
-        .parent()
-        .filter(|parent| !parent.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
-    ensure!(
-        directory.is_dir(),
-        "cannot write {}: make the directory first",
-        path.display()
-    );
-    ensure!(
-        !path.exists(),
-        "cannot write {}: it exists, choose another name for --output",
-        path.display()
-    );
-    Ok(())
 }
 
 /// The nodes of the street that comes with the program: two cameras that stay where they are.
@@ -306,10 +306,10 @@ fn vehicle(name: NodeName, camera: CameraConfig) -> NodeConfig {
 
 /// The running vehicles of `try`.
 struct Trial {
-    /// File for the first vehicle's configuration.
-    output: Option<PathBuf>,
-    /// Whether people who walk give height and tilt of the cameras.
-    finds_cameras: bool,
+    /// Files for the configurations of the vehicles; empty without `--output`.
+    templates: Vec<Template>,
+    /// The guesses about each vehicle.
+    guesses: Vec<Guess>,
     vehicles: Vec<Vehicle>,
 }
 
@@ -317,8 +317,7 @@ struct Trial {
 struct Vehicle {
     /// The configuration, as `--output` writes it.
     config: NodeConfig,
-    /// The text that `--output` has written.
-    saved: Option<String>,
+    guesses: Vec<Guess>,
     /// Address of its page.
     page: SocketAddr,
     /// `None` if height and tilt of the camera are stated or found.
@@ -349,7 +348,14 @@ impl Vehicle {
     }
 }
 
+/// Guesses that people who walk replace, if all of them are guesses.
+const MOUNT: [Guess; 2] = [Guess::Height, Guess::Tilt];
+
 impl Trial {
+    fn finds_cameras(&self) -> bool {
+        MOUNT.iter().all(|guess| self.guesses.contains(guess))
+    }
+
     /// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
     async fn serve(mut self, configs: Vec<NodeConfig>, stop_at_eof: bool) -> anyhow::Result<()> {
         let outcome = tokio::select! {
@@ -379,6 +385,7 @@ impl Trial {
                 eprintln!("page of {}: http://{page}/", vehicle.name());
             }
             self.vehicles.push(vehicle);
+            self.share_pictures();
             self.save(index)?;
         }
         self.watch().await
@@ -389,7 +396,7 @@ impl Trial {
     async fn start(&self, mut config: NodeConfig) -> anyhow::Result<Vehicle> {
         let mut running = config.clone();
         let mut watch = None;
-        if self.finds_cameras
+        if self.finds_cameras()
             && let Some(camera) = running.camera.take()
         {
             let (people, camera) = CameraWatch::new(camera)?;
@@ -405,36 +412,32 @@ impl Trial {
         }
         Ok(Vehicle {
             config,
-            saved: None,
+            guesses: self.guesses.clone(),
             page,
             watch,
             node,
         })
     }
 
-    /// Writes the configuration of a vehicle, if requested. A file that has changed since the last
-    /// time stays as it is.
+    /// Writes the configuration of a vehicle, if requested.
     fn save(&mut self, index: usize) -> anyhow::Result<()> {
-        let Some(path) = &self.output else {
+        let vehicle = &self.vehicles[index];
+        let Some(template) = self.templates.get_mut(index) else {
             return Ok(());
         };
-        let path = numbered(path, index);
-        let vehicle = &mut self.vehicles[index];
-        let text = vehicle
-            .config
-            .to_toml_changed()
-            .context("the configuration cannot be written as TOML")?;
-        let written = match &vehicle.saved {
-            None => File::create_new(&path).and_then(|mut file| file.write_all(text.as_bytes())),
-            Some(saved) => {
-                let is_edited = bounded_file::read_text(&path)? != *saved;
-                ensure!(!is_edited, "{} was edited", path.display());
-                std::fs::write(&path, &text)
-            }
-        };
-        written.with_context(|| format!("cannot write {}", path.display()))?;
-        vehicle.saved = Some(text);
-        Ok(())
+        template.write(&vehicle.config, &vehicle.guesses)
+    }
+
+    /// Shows the pictures of all vehicles on the page of each.
+    fn share_pictures(&self) {
+        for vehicle in &self.vehicles {
+            let others = self
+                .vehicles
+                .iter()
+                .filter(|other| other.page != vehicle.page)
+                .flat_map(|other| other.node.cameras());
+            vehicle.node.show_cameras(others.cloned().collect());
+        }
     }
 
     /// Reports progress, and starts a vehicle anew when its camera is found, until a node gives up.
@@ -492,7 +495,7 @@ impl Trial {
     async fn use_camera(&mut self, index: usize, estimate: &MountEstimate) -> anyhow::Result<()> {
         let Vehicle {
             mut config,
-            saved,
+            mut guesses,
             page,
             node,
             ..
@@ -504,9 +507,11 @@ impl Trial {
         let mut running = config.clone();
         running.dashboard.listen = Some(page);
         let node = node::start(running).await?;
+        guesses.retain(|guess| !MOUNT.contains(guess));
+        guesses.push(Guess::MountFromPeople);
         let vehicle = Vehicle {
             config,
-            saved,
+            guesses,
             page,
             watch: None,
             node,
@@ -520,6 +525,7 @@ impl Trial {
             if pitch_deg < 0.0 { "up" } else { "down" }
         );
         self.vehicles.insert(index, vehicle);
+        self.share_pictures();
         if let Err(error) = self.save(index) {
             eprintln!("the file keeps the guessed mount: {error:#}");
         }
@@ -560,29 +566,24 @@ mod tests {
     use crate::camera::detect::recorded::RecordedConfig;
     use crate::camera::image_codec::encode_jpeg;
 
-    #[tokio::test(flavor = "multi_thread")]
-    async fn walking_people_replace_guessed_mount() {
-        let directory = tempfile::tempdir().unwrap();
+    /// A vehicle with a guessed mount, before whose camera people walk.
+    fn sees_walkers(directory: &Path) -> NodeConfig {
         let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
-        std::fs::write(
-            directory.path().join("0.jpg"),
-            encode_jpeg(&blank, 95).unwrap(),
-        )
-        .unwrap();
+        std::fs::write(directory.join("0.jpg"), encode_jpeg(&blank, 95).unwrap()).unwrap();
         let real = Mount {
             height_m: Some(3.5),
             pitch_rad: 18f64.to_radians(),
             ..Mount::default()
         };
         let optics = Intrinsics::with_square_pixels(1280, 720, 62.2f64.to_radians());
-        let boxes = directory.path().join("boxes.jsonl");
+        let boxes = directory.join("boxes.jsonl");
         let lines = (0..300).map(|frame| {
             let people = walking_people(f64::from(frame) * 0.3, &real, optics);
             serde_json::to_string(&people).unwrap() + "\n"
         });
         std::fs::write(&boxes, lines.collect::<String>()).unwrap();
         let source = SourceConfig::Images {
-            path: directory.path().to_owned(),
+            path: directory.to_owned(),
             fps: 100.0,
             looping: true,
         };
@@ -594,26 +595,78 @@ mod tests {
             path: boxes,
             looping: true,
         });
-        let saved = directory.path().join("node.toml");
-        let trial = Trial {
-            output: Some(saved.clone()),
-            finds_cameras: true,
+        config
+    }
+
+    fn saved_to(path: &Path) -> Trial {
+        Trial {
+            templates: vec![Template::new(path.to_owned()).unwrap()],
+            guesses: vec![
+                Guess::FieldOfView,
+                Guess::Height,
+                Guess::Tilt,
+                Guess::Position,
+            ],
             vehicles: Vec::new(),
-        };
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn walking_people_replace_guessed_mount() {
+        let directory = tempfile::tempdir().unwrap();
+        let saved = directory.path().join("node.toml");
+        let trial = saved_to(&saved);
+        let text = || std::fs::read_to_string(&saved).unwrap_or_default();
         let found = || -> Option<[f64; 2]> {
-            let text = std::fs::read_to_string(&saved).ok()?;
-            let config: toml::Table = text.parse().ok()?;
-            let mount = config["camera"]["mount"].as_table()?;
+            let config: toml::Table = text().parse().ok()?;
+            let mount = config.get("camera")?.get("mount")?.as_table()?;
             let pitch_deg = mount.get("pitch_deg")?.as_float()?;
             Some([mount.get("height_m")?.as_float()?, pitch_deg])
         };
         let is_found = || found().is_some_and(|[height_m, _]| height_m != CAMERA_HEIGHT_M);
         tokio::select! {
-            outcome = trial.serve(vec![config], false) => panic!("ended: {outcome:?}"),
+            outcome = trial.serve(vec![sees_walkers(directory.path())], false) => panic!("ended: {outcome:?}"),
             _ = until("the mount is found", is_found) => {}
         }
         let [height_m, pitch_deg] = found().unwrap();
         assert!((height_m / 3.5 - 1.0).abs() < 0.08, "{height_m}");
         assert!((pitch_deg - 18.0).abs() < 1.0, "{pitch_deg}");
+        let advice = format!("camera.mount: {height_m} m and {pitch_deg}° are estimated");
+        let text = text();
+        assert!(
+            text.contains(&advice) && !text.contains("Measure with a tape"),
+            "{text}"
+        );
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn edited_file_survives_found_mount() {
+        let directory = tempfile::tempdir().unwrap();
+        let saved = directory.path().join("node.toml");
+        let mut trial = saved_to(&saved);
+        let started = trial.start(sees_walkers(directory.path())).await.unwrap();
+        trial.vehicles.push(started);
+        trial.save(0).unwrap();
+        let edited = std::fs::read_to_string(&saved).unwrap() + "# my own\n";
+        std::fs::write(&saved, &edited).unwrap();
+        let estimate = MountEstimate {
+            mount: Mount {
+                height_m: Some(3.5),
+                ..Mount::default()
+            },
+            pitch_sigma_rad: 0.01,
+            roll_sigma_rad: 0.01,
+            height_sigma_m: 0.05,
+        };
+        trial.use_camera(0, &estimate).await.unwrap();
+        let vehicle = trial.vehicles.remove(0);
+        let mount = vehicle.config.camera.as_ref().unwrap().mount;
+        assert_eq!(
+            mount.height_m,
+            Some(3.5),
+            "the vehicle uses the found mount"
+        );
+        assert_eq!(std::fs::read_to_string(&saved).unwrap(), edited);
+        vehicle.node.stop().await;
     }
 }

@@ -6,6 +6,7 @@
 
 mod cameras;
 mod cells;
+pub mod descriptions;
 mod extraction;
 pub(crate) mod guidance;
 mod observer;

@@ -136,7 +136,7 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
         algorithms: config.fusion.algorithms,
         landmarks: config.landmarks.clone().into(),
         boxes: box_projector(config, held),
-        has_origin: config.origin.is_some(),
+        origin: config.origin,
         contradicts: held.problem.is_some(),
         problem: held.problem.clone().or_else(|| pose_problem(config)),
     }

@@ -61,6 +61,8 @@ pub(super) struct VehicleParts {
     pub(super) detectors: Vec<ActorSlot<DetectorMessage>>,
     /// The cameras, if the page shows their pictures.
     pub(super) shown_cameras: Vec<ShownCamera>,
+    /// Cameras of other nodes of this process whose pictures the page shows, too.
+    pub(super) further_cameras: watch::Sender<Vec<ShownCamera>>,
     /// Address of the broker, for any use.
     pub(super) listens_at: watch::Sender<Option<SocketAddr>>,
     pub(super) dashboard_address: watch::Sender<Option<SocketAddr>>,
@@ -89,6 +91,7 @@ impl VehicleParts {
             #[cfg(feature = "camera")]
             detectors,
             shown_cameras,
+            further_cameras: watch::Sender::default(),
             listens_at: watch::Sender::new(None),
             dashboard_address: watch::Sender::new(None),
         }

@@ -258,7 +258,11 @@ async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Ch
             map = maps.wait_for(Option::is_some) => map.is_ok(),
             verdicts = verdicts.wait_for(Option::is_some) => verdicts.is_ok(),
         };
-        has_round && shared.wait_for(|shared| shared.has_origin).await.is_ok()
+        has_round
+            && shared
+                .wait_for(|shared| shared.origin.is_some())
+                .await
+                .is_ok()
     };
     let change = tokio::select! {
         true = follows => Change::Follows,

@@ -11,6 +11,7 @@ use ecod::leadership::Leadership;
 use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
 use ecod::model::epoch::Epoch;
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::perception::box_projection::BoxProjector;
 use ecod::perception::landmark::LandmarkConfig;
@@ -68,8 +69,8 @@ pub struct SharedFacts {
     pub landmarks: Arc<[LandmarkConfig]>,
     /// Projects the boxes of programs.
     pub boxes: Arc<BoxProjector>,
-    /// True if the cell's frame has a place on Earth.
-    pub has_origin: bool,
+    /// The place of the cell's frame on Earth.
+    pub origin: Option<GeographicOrigin>,
     /// True if the node does not use the cell's description.
     pub contradicts: bool,
     /// The reason why the node does not use the cell's description, or does not report.

@@ -18,6 +18,7 @@ async fn only_health_needs_no_token() {
         "/api/history",
         "/api/frame?at=1",
         "/api/camera",
+        "/api/cameras",
         "/api/floor_plan",
     ];
     for path in api
@@ -35,7 +36,7 @@ async fn only_health_needs_no_token() {
     )
     .await;
     assert_eq!(points.status, 401);
-    assert_eq!(node.counters().events(Event::BrowserRefused), 11);
+    assert_eq!(node.counters().events(Event::BrowserRefused), 12);
     assert_eq!(get(page, "/healthz").await.status, 200);
 
     let host = ("Host", "localhost");

@@ -1,5 +1,6 @@
 //! The node's own picture with its boxes.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -13,7 +14,7 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::Event;
 use opencv::prelude::MatTraitConst;
 
-use crate::cell::{config, start, until};
+use crate::cell::{PATIENCE, config, join, start, until};
 use crate::http::{Events, get};
 use crate::webdriver::Browser;
 
@@ -283,57 +284,118 @@ async fn camera_name_selects_pictures() {
     node.stop().await;
 }
 
-/// A camera is chosen by its name; its boxes light up with the objects behind the vehicle. Points for its mount are its own.
+/// One connection carries the pictures of all cameras, also of another node of the process, until that node's cameras
+/// change.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn all_pictures_share_connection() {
+    let directory = tempfile::tempdir().unwrap();
+    let (node, page) = start(seeing_both_ways(&directory.path().join("euclid"))).await;
+    let (other, _) = start(gauss(directory.path())).await;
+    node.show_cameras(other.cameras().to_vec());
+    let names = ["euclid", "euclid--rear", "gauss"];
+    let facts = get(page, "/api/picture").await.json();
+    assert_eq!(facts["node"]["pictures"], serde_json::json!(names));
+    assert_eq!(facts["node"]["cameras"], serde_json::json!([null, "rear"]));
+
+    let mut pictures = Events::open_at(page, "/api/cameras").await;
+    let mut first_labels = BTreeMap::new();
+    while first_labels.len() < names.len() {
+        let picture = pictures.next().await;
+        first_labels.insert(
+            pictures.id.clone(),
+            picture["boxes"][0]["label"].as_str().unwrap().to_owned(),
+        );
+    }
+    let wanted = names.into_iter().zip(["person", "dog", "horse"]);
+    assert!(
+        first_labels
+            .iter()
+            .map(|(name, label)| (&**name, &**label))
+            .eq(wanted),
+        "{first_labels:?}"
+    );
+    let mut rear = Events::open_at(page, "/api/cameras?of=euclid--rear").await;
+    for _ in 0..3 {
+        rear.next().await;
+        assert_eq!(rear.id, "euclid--rear");
+    }
+    assert_eq!(get(page, "/api/cameras?of=kepler").await.status, 404);
+
+    node.show_cameras(Vec::new());
+    let ended = async { while pictures.next_or_end().await.is_some() {} };
+    tokio::time::timeout(PATIENCE, ended)
+        .await
+        .expect("pictures of a node that is not shown any more");
+    other.stop().await;
+    node.stop().await;
+}
+
+/// A vehicle that detects a horse.
+fn gauss(directory: &Path) -> NodeConfig {
+    let camera = camera(
+        &directory.join("gauss"),
+        "chelsea",
+        &[("horse", [0.45, 0.5, 0.55, 0.7])],
+    );
+    NodeConfig {
+        camera: Some(camera),
+        ..config("gauss", Role::Auto, 0)
+    }
+}
+
+/// The wall shows the pictures of all cameras with their boxes, which light up with the objects of their vehicles. A
+/// camera is shown alone by its name. Points for its mount are its own.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn each_camera_can_be_viewed() {
+async fn wall_shows_all_cameras() {
     let shots = shots();
     let directory = tempfile::tempdir().unwrap();
-    let (node, page) = start(seeing_both_ways(directory.path())).await;
+    let (node, page) = start(seeing_both_ways(&directory.path().join("euclid"))).await;
+    let mut other = gauss(directory.path());
+    other.pose.y_m = -6.0;
+    let (other, other_page) = join(other, &node).await;
+    node.show_cameras(other.cameras().to_vec());
     sees_objects(page).await;
     let browser = Browser::start().await;
     browser.look(1440, 900, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
-    browser
-        .until(&format!("{words} === 'person 87 %,cat 87 %,dragon 87 %'"))
-        .await;
+    let wall = "[...document.querySelectorAll('#camera-wall figure')].map((it) => [it.querySelector('figcaption button').textContent, \
+        ...[...it.querySelectorAll('.boxes button')].map((box) => box.textContent)].join(' ')).join()";
+    let all = "euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %,gauss horse 87 %";
+    browser.until(&format!("{wall} === '{all}'")).await;
+    let is_drawn = "[...document.querySelectorAll('#camera-wall canvas')].every((it) => it.getContext('2d').getImageData(200, 200, 1, 1).data[3] === 255)";
+    browser.until(is_drawn).await;
     let names =
         "[...document.querySelector('#camera-name').options].map((option) => option.text).join()";
-    assert_eq!(browser.evaluate(names).await, "euclid,rear");
-    let choose = |index: usize| {
-        format!(
-            "((chooser) => (chooser.selectedIndex = {index}, chooser.dispatchEvent(new Event('change'))))\
-             (document.querySelector('#camera-name'))"
-        )
-    };
-    let rows =
-        |count: usize| format!("document.querySelectorAll('#mount-rows tr').length === {count}");
-    browser
-        .evaluate("document.querySelector('#mount').click()")
-        .await;
-    browser.click_within("#camera", [0.5, 0.9]).await;
-    browser.until(&rows(1)).await;
-
-    browser.evaluate(&choose(1)).await;
-    browser
-        .until(&format!("{words} === 'dog 87 %' && {}", rows(0)))
-        .await;
-    browser
-        .evaluate("document.querySelector('#mount').click()")
-        .await;
-    browser
-        .until("document.querySelectorAll('#map g[aria-label^=dog]').length === 1")
-        .await;
-    browser.point_at("#camera-boxes button").await;
+    assert_eq!(
+        browser.evaluate(names).await,
+        "All cameras,euclid,euclid--rear,gauss"
+    );
     let lit = "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
-    browser
-        .until(&format!(
-            "{lit} === 'dog' && document.querySelectorAll('#camera-boxes .lit').length === 1"
-        ))
-        .await;
-    for (name, width) in [("cameras", 1440), ("cameras-phone", 390)] {
-        browser.look(width, 900, "light").await;
+    for (figure, label) in [(2, "dog"), (3, "horse")] {
+        browser
+            .until(&format!(
+                "document.querySelectorAll('#map g[aria-label^={label}]').length === 1"
+            ))
+            .await;
+        browser
+            .point_at(&format!(
+                "#camera-wall figure:nth-child({figure}) .boxes button"
+            ))
+            .await;
+        browser
+            .until(&format!(
+                "{lit} === '{label}' && document.querySelectorAll('#camera-wall .lit').length === 1"
+            ))
+            .await;
+    }
+    browser.point_at("#camera-title").await;
+    for (name, width, scheme) in [
+        ("wall-light", 1440, "light"),
+        ("wall-dark", 1440, "dark"),
+        ("wall-phone", 390, "light"),
+    ] {
+        browser.look(width, 900, scheme).await;
         browser
             .evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })")
             .await;
@@ -345,11 +407,63 @@ async fn each_camera_can_be_viewed() {
     browser
         .evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })")
         .await;
-    browser.evaluate(&choose(0)).await;
+
+    // The mount of the node's first camera, and then of its second.
+    let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
+    let rows =
+        |count: usize| format!("document.querySelectorAll('#mount-rows tr').length === {count}");
+    let choose = |index: usize| {
+        format!(
+            "((chooser) => (chooser.selectedIndex = {index}, chooser.dispatchEvent(new Event('change'))))\
+             (document.querySelector('#camera-name'))"
+        )
+    };
+    browser
+        .evaluate("document.querySelector('#mount').click()")
+        .await;
+    browser
+        .until(&format!("{words} === 'person 87 %,cat 87 %,dragon 87 %'"))
+        .await;
+    browser.click_within("#camera", [0.5, 0.9]).await;
+    browser.until(&rows(1)).await;
+    browser.evaluate(&choose(2)).await;
+    browser
+        .until(&format!("{words} === 'dog 87 %' && {}", rows(0)))
+        .await;
+    browser.evaluate(&choose(1)).await;
     browser
         .until(&format!(
             "{words} === 'person 87 %,cat 87 %,dragon 87 %' && {}",
             rows(1)
+        ))
+        .await;
+
+    // Another node's camera has its mount on that node's page.
+    browser.evaluate(&choose(0)).await;
+    browser
+        .until("document.querySelector('#mount-points').hidden && !document.querySelector('#camera-wall').hidden")
+        .await;
+    browser
+        .evaluate(
+            "document.querySelector('#camera-wall figure:nth-child(3) figcaption button').click()",
+        )
+        .await;
+    browser
+        .until(&format!(
+            "{words} === 'horse 87 %' && document.querySelector('#mount').disabled"
+        ))
+        .await;
+    node.show_cameras(Vec::new());
+    browser
+        .until(&format!(
+            "document.querySelectorAll('#camera-wall figure').length === 2 \
+             && document.querySelector('#camera-pages a')?.href === 'http://{other_page}/' \
+             && document.querySelector('#camera-pages').checkVisibility()"
+        ))
+        .await;
+    browser
+        .until(&format!(
+            "{wall} === 'euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %'"
         ))
         .await;
     browser.quit_without_complaints().await;
@@ -357,6 +471,7 @@ async fn each_camera_can_be_viewed() {
         shown_after(&node, Duration::from_millis(600)).await == 0
     })
     .await;
+    other.stop().await;
     node.stop().await;
 }
 

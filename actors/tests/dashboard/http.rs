@@ -119,7 +119,11 @@ fn joined(mut chunks: &str) -> String {
 }
 
 /// Pictures as they come.
-pub(crate) struct Events(BufReader<TcpStream>);
+pub(crate) struct Events {
+    stream: BufReader<TcpStream>,
+    /// The `id` of the last event that has one.
+    pub(crate) id: String,
+}
 
 impl Events {
     pub(crate) async fn open(address: SocketAddr) -> Self {
@@ -132,19 +136,33 @@ impl Events {
             .write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
             .await
             .unwrap();
-        Self(BufReader::new(stream))
+        Self {
+            stream: BufReader::new(stream),
+            id: String::new(),
+        }
     }
 
     pub(crate) async fn next(&mut self) -> serde_json::Value {
+        self.next_or_end().await.expect("the stream ended")
+    }
+
+    /// The next picture; `None` at the end of the stream.
+    pub(crate) async fn next_or_end(&mut self) -> Option<serde_json::Value> {
         loop {
             let mut line = String::new();
-            let read = timeout(PATIENCE, self.0.read_line(&mut line))
+            let read = timeout(PATIENCE, self.stream.read_line(&mut line))
                 .await
                 .expect("no picture")
                 .unwrap();
-            assert!(read > 0, "the stream ended");
+            // The last chunk of a stream is empty.
+            if read == 0 || line == "0\r\n" {
+                return None;
+            }
+            if let Some(id) = line.strip_prefix("id: ") {
+                id.trim_end().clone_into(&mut self.id);
+            }
             if let Some(data) = line.strip_prefix("data: ") {
-                return serde_json::from_str(data).unwrap();
+                return Some(serde_json::from_str(data).unwrap());
             }
         }
     }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
 use ecod::tracking::TracksMode;
-use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, WirePose, encode};
+use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, WirePose, encode};
 use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::dashboard::{FloorPlanConfig, FloorPlanPoint};
@@ -218,6 +219,253 @@ async fn far_object_is_indicated() {
     node.stop().await;
 }
 
+/// A vehicle that reports some objects at each tick, and further ones during its first second.
+fn report(
+    broker: std::net::SocketAddr,
+    always: Vec<PerceivedObject>,
+    at_first: Vec<PerceivedObject>,
+) -> JoinSet<()> {
+    let mut vehicles = JoinSet::new();
+    vehicles.spawn(async move {
+        let options = MqttOptions::new("galileo", broker.ip().to_string(), broker.port());
+        let (client, mut events) = AsyncClient::new(options, 16);
+        let mut ticks = tokio::time::interval(Duration::from_millis(100));
+        for seq in 1.. {
+            while tokio::select! { _ = events.poll() => true, _ = ticks.tick() => false } {}
+            let mut objects = always.clone();
+            if seq <= 10 {
+                objects.extend(at_first.clone());
+            }
+            let report = ObjectReport {
+                pose: Some(WirePose::new(-4.0, 0.0, 0.0)),
+                objects,
+                view: Some(FieldOfView {
+                    range_m: 20.0,
+                    angle_rad: 2.0,
+                }),
+                ..ObjectReport::new(NodeName::from_static("galileo"), seq, clock::now())
+            };
+            // An absent broker receives no messages.
+            let _ = client.try_publish(
+                "ecod/v1/lot/detections/galileo",
+                QoS::AtMostOnce,
+                false,
+                encode(&report, Encoding::Json),
+            );
+        }
+    });
+    vehicles
+}
+
+/// An object that is not detected any more becomes pale, leaves the fit, and is hidden, which a button undoes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn unsure_object_fades_and_hides() {
+    let mut patient = tracking(0);
+    (patient.fusion.tracks.life_s, patient.fusion.tracks.latent_s) = (60.0, 60.0);
+    let (node, page) = start(patient).await;
+    let browser = Browser::start().await;
+    browser.look(1280, 800, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    browser
+        .until("document.querySelector('#leader').textContent === 'euclid'")
+        .await;
+    let _vehicle = report(
+        node.broker_address().unwrap(),
+        vec![object("cup", 2.0, 1.0, 0.1), object("dog", 4.0, -2.0, 0.1)],
+        vec![object("ghost", 80.0, 30.0, 0.1)],
+    );
+    let ghost = "document.querySelector('#map g[aria-label^=ghost]')";
+    let is_pale = format!("{ghost}?.classList.contains('unsure')");
+    browser
+        .until(&format!("{ghost} !== null && !{is_pale}"))
+        .await;
+    browser
+        .until(&format!(
+            "{is_pale} && {ghost}.getAttribute('aria-label').includes('unsure')"
+        ))
+        .await;
+    browser.screenshot(&shots().join("unsure-pale.png")).await;
+    let button = "document.querySelector('#map-unsure')";
+    browser
+        .until(&format!(
+            "{ghost} === null && {button}.textContent === '1 unsure object hidden, show' && !{button}.hidden"
+        ))
+        .await;
+    let width = "(([cup, dog]) => Math.hypot(cup.getAttribute('cx') - dog.getAttribute('cx'), cup.getAttribute('cy') - dog.getAttribute('cy')))\
+        (['cup', 'dog'].map((it) => document.querySelector(`#map g[aria-label^=${it}] .centre`)))";
+    browser.until(&format!("{width} > 100")).await;
+    let described = "document.querySelector('#map').getAttribute('aria-label')";
+    let described = browser.evaluate(described).await;
+    assert!(
+        described
+            .as_str()
+            .unwrap()
+            .ends_with("without 1 unsure object"),
+        "{described}"
+    );
+    for (name, size, scheme) in [
+        ("unsure-light", 1280, "light"),
+        ("unsure-dark", 1280, "dark"),
+        ("unsure-phone", 390, "light"),
+    ] {
+        browser.look(size, 844, scheme).await;
+        browser
+            .screenshot(&shots().join(format!("{name}.png")))
+            .await;
+        browser.fits_the_width(name).await;
+    }
+    browser.look(1280, 800, "light").await;
+    browser.click("#map-unsure").await;
+    browser
+        .until(&format!(
+            "{is_pale} && {button}.textContent === '1 unsure object shown, hide' && {button}.ariaPressed === 'true'"
+        ))
+        .await;
+    assert!(
+        browser.evaluate(width).await.as_f64().unwrap() > 100.0,
+        "the map stays as it was fitted"
+    );
+    browser
+        .until("/^ghost, [0-9]+ m$/.test(document.querySelector('#map text.cue')?.textContent)")
+        .await;
+    browser.quit_without_complaints().await;
+    node.stop().await;
+}
+
+/// Labels of a crowd are apart, and the label of a surer object takes the only place.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn labels_do_not_overlap() {
+    let (node, page) = start(tracking(0)).await;
+    let labels = ["WAGGON", "ill", "bicycle", "person", "sports ball", "MMM"];
+    let crowd = (0..60)
+        .map(|index| {
+            let x_m = f64::from(index % 10) * 0.9 + 0.3 * f64::from(index / 10);
+            let y_m = f64::from(index / 10) * 0.9 - 2.0;
+            object(labels[index as usize % labels.len()], x_m, y_m, 0.05)
+        })
+        .collect();
+    let _vehicle = report(node.broker_address().unwrap(), crowd, Vec::new());
+    let browser = Browser::start().await;
+    browser.look(1280, 800, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    browser
+        .until("document.querySelectorAll('#map .ellipse').length >= 60")
+        .await;
+    let overlaps = "((areas) => areas.flatMap((a, i) => areas.slice(i + 1).filter((b) => \
+        a.x + 1 < b.x + b.width && b.x + 1 < a.x + a.width && a.y + 1 < b.y + b.height && b.y + 1 < a.y + a.height).map((b) => `${a.words} and ${b.words}`)))\
+        ([...document.querySelectorAll('#map text')].filter((it) => it.textContent).map((it) => { \
+            const { x, y, width, height } = it.getBoundingClientRect(); return { x, y, width, height, words: it.textContent }; }))";
+    let shown = "document.querySelectorAll('#map text').length";
+    for (name, size) in [("labels", 1280), ("labels-phone", 390)] {
+        browser.look(size, 844, "light").await;
+        browser.until(&format!("{shown} >= 10")).await;
+        assert_eq!(
+            browser.evaluate(overlaps).await,
+            serde_json::json!([]),
+            "{name}"
+        );
+        browser
+            .screenshot(&shots().join(format!("{name}.png")))
+            .await;
+    }
+    let placed = "import('/labels.js').then(({ Labels }) => { \
+        const labels = new Labels(); labels.begin({ width: 90, height: 20 }, document.body); \
+        for (const [key, rank] of [['pale', 1.4], ['sure', 1.9], ['hidden', 1.1]]) labels.put({ key, rank, words: 'a long label', x: 2, y: 10, gap: 4, style: '' }); \
+        labels.place(); return labels.placed.map((label) => label.key).join(); })";
+    assert_eq!(browser.evaluate(placed).await, "sure");
+    browser.quit_without_complaints().await;
+    node.stop().await;
+}
+
+/// The pointer shows its position in the frame and on Earth; the arrow points to north in a frame that is turned.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn pointer_shows_position_on_earth() {
+    let origin = GeographicOrigin {
+        latitude_deg: 52.2297,
+        longitude_deg: 21.0122,
+        height_m: 110.0,
+        rotation_deg: 30.0,
+    };
+    let mut located = tracking(12);
+    located.origin = Some(origin);
+    let far = located.landmarks[11].clone();
+    let (node, page) = start(located).await;
+    let browser = Browser::start().await;
+    browser.look(1280, 800, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    browser
+        .until("document.querySelectorAll('#map .place').length === 12")
+        .await;
+    let readout = "document.querySelector('#map-at').textContent";
+    assert_eq!(
+        browser.evaluate(readout).await,
+        "Point at the map for coordinates"
+    );
+    browser
+        .evaluate("document.querySelectorAll('#map rect.place')[11].id = 'far'")
+        .await;
+    browser.point_at("#far").await;
+    browser.until(&format!("{readout}.startsWith('x ')")).await;
+    let words = browser.evaluate(readout).await;
+    let words = words.as_str().unwrap();
+    let numbers: Vec<f64> = words
+        .split(|letter: char| !(letter.is_ascii_digit() || ".-".contains(letter)))
+        .filter_map(|number| number.parse().ok())
+        .collect();
+    let expected = origin.to_wgs84(far.x_m, far.y_m, 0.0);
+    let wanted = [
+        (far.x_m, 0.1),
+        (far.y_m, 0.1),
+        (expected.latitude_deg, 2e-6),
+        (expected.longitude_deg, 2e-6),
+    ];
+    assert_eq!(numbers.len(), 4, "{words}");
+    for (number, (wanted, tolerance)) in numbers.iter().zip(wanted) {
+        assert!((number - wanted).abs() < tolerance, "{words}: {wanted}");
+    }
+    let far_away = "import('/earth.js').then(({ onEarth }) => onEarth({ x_m: 4000, y_m: -3000 }, \
+        { latitude_deg: 52.2297, longitude_deg: 21.0122, height_m: 110, rotation_deg: 30 }))";
+    let far_away: [f64; 2] = serde_json::from_value(browser.evaluate(far_away).await).unwrap();
+    let expected = origin.to_wgs84(4000.0, -3000.0, 0.0);
+    assert!(
+        (far_away[0] - expected.latitude_deg).abs() < 1e-8,
+        "{far_away:?}"
+    );
+    assert!(
+        (far_away[1] - expected.longitude_deg).abs() < 1e-8,
+        "{far_away:?}"
+    );
+    browser
+        .until("document.querySelector('#map .north path').getAttribute('transform').endsWith('rotate(30.0)')")
+        .await;
+    browser
+        .until(&format!(
+            "/On Earth 52\\.[0-9]+° N, 21\\.[0-9]+° E/.test({DETAILS})"
+        ))
+        .await;
+    for (name, size) in [("earth", 1280), ("earth-phone", 390)] {
+        browser.look(size, 800, "light").await;
+        browser
+            .screenshot(&shots().join(format!("{name}.png")))
+            .await;
+        browser.fits_the_width(name).await;
+    }
+    browser.look(1280, 800, "light").await;
+    let scale = "document.querySelector('#map text.scale').textContent";
+    browser
+        .until(&format!("/^[125]0* (m|cm)$/.test({scale})"))
+        .await;
+    browser.point_at("#map-title").await;
+    browser
+        .until(&format!("{readout} === 'Point at the map for coordinates'"))
+        .await;
+    browser.quit_without_complaints().await;
+    node.stop().await;
+}
+
 /// Explanations of terms are available by pointer, by keyboard, and by screen reader.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
@@ -330,7 +578,7 @@ async fn floor_plan_lies_under_map() {
     let answer = get(page, "/api/floor_plan").await;
     assert_eq!(
         (answer.status, answer.header("content-type")),
-        (200, Some("image/png"))
+        (200, Some("image/jpeg"))
     );
     let _vehicles = watch(node.broker_address().unwrap());
     let browser = Browser::start().await;

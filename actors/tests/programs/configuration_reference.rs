@@ -7,6 +7,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use ecod_actors::node::config::NodeConfig;
+use ecod_actors::node::config::descriptions::sentences;
 use serde_json::{Map, Value};
 
 /// A configuration in which each section that has required keys has them.
@@ -274,21 +275,6 @@ fn meaning(description: &str) -> (String, Option<String>) {
         }
     }
     (kept.join(" "), default)
-}
-
-/// Sentences end with a full stop before a space and a capital letter or a code span.
-fn sentences(text: &str) -> Vec<String> {
-    let mut found = Vec::new();
-    let mut start = 0;
-    for (position, _) in text.match_indices(". ") {
-        let next = text[position + 2..].chars().next();
-        if next.is_some_and(|letter| letter.is_uppercase() || letter == '`') {
-            found.push(text[start..=position].to_owned());
-            start = position + 2;
-        }
-    }
-    found.push(text[start..].to_owned());
-    found
 }
 
 /// The default of a key as a loaded configuration has it.

@@ -106,13 +106,13 @@ fn objects(page: &str) -> Option<Vec<(String, f64)>> {
     )
 }
 
-/// Labels of the boxes in the next picture on a page.
-fn boxes(page: &str) -> Vec<String> {
+/// Labels of the boxes in a vehicle's next picture on a page.
+fn boxes(page: &str, vehicle: &str) -> Vec<String> {
     let mut stream = TcpStream::connect(page).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     write!(
         stream,
-        "GET /api/camera HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        "GET /api/cameras?of={vehicle} HTTP/1.1\r\nHost: localhost\r\n\r\n"
     )
     .unwrap();
     let mut lines = BufReader::new(stream).lines().map_while(Result::ok);
@@ -170,11 +170,13 @@ fn two_cameras_make_one_map() {
         std::iter::from_fn(next_line).any(|line| told(&line)),
         "progress is printed"
     );
-    for (label, page) in [("cat", &page), ("person", &second)] {
-        assert!(
-            boxes(page).contains(&label.to_owned()),
-            "{label} is not in the picture on its page"
-        );
+    for page in [&page, &second] {
+        for (label, vehicle) in [("cat", "images-1"), ("person", "images-2")] {
+            assert!(
+                boxes(page, vehicle).contains(&label.to_owned()),
+                "{label} is not in the picture of {vehicle} on {page}"
+            );
+        }
     }
     let distance = |label: &str| found.iter().find(|(seen, _)| seen == label).unwrap().1;
     assert!(
@@ -202,6 +204,22 @@ fn two_cameras_make_one_map() {
             printed.status.success() && text.contains(images) && text.contains("height_m = 1.4"),
             "{text}"
         );
+        let template = fs::read_to_string(&path).unwrap();
+        for guess in ["camera.optics", "camera.mount.pitch_deg", "pose"] {
+            assert!(template.contains(&format!("# - {guess}: ")), "{template}");
+        }
+        assert!(
+            !template.contains("# - camera.mount.height_m"),
+            "{template}"
+        );
+        for pair in template.lines().collect::<Vec<_>>().windows(2) {
+            let is_stated = !pair[1].is_empty() && !pair[1].starts_with('#');
+            assert!(
+                !is_stated || pair[0].starts_with("# "),
+                "{} has no comment in:\n{template}",
+                pair[1]
+            );
+        }
     }
 }
 

@@ -13,6 +13,7 @@ use ecod::model::detection::{BoundingBox, Detection};
 use opencv::core::{CV_8UC3, CV_32F, Mat, Rect, Scalar, Size, Vector};
 use opencv::dnn::{self, Net};
 use opencv::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use self::anchors::Anchor;
@@ -23,7 +24,7 @@ use crate::platform::bounded_file;
 use crate::platform::installed;
 
 /// Configuration of the COCO detector.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CocoConfig {
     /// ONNX file with the inputs and outputs of the built-in model. Default: not set, the built-in

@@ -4,6 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use ecod::config::ConfigError;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Detect;
@@ -13,7 +14,7 @@ use super::placard::{PlacardConfig, PlacardDetector};
 use super::recorded::{RecordedConfig, RecordedDetector};
 
 /// The detector of a camera.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum DetectorConfig {
     /// QR codes on placards.

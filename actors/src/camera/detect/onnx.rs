@@ -16,6 +16,7 @@ use std::path::PathBuf;
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::Detection;
 use ecod::model::names::Label;
+use schemars::JsonSchema;
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -32,7 +33,7 @@ use crate::camera::image_size::ImageSize;
 use crate::platform::bounded_file;
 
 /// Configuration of the detector of exported models.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OnnxConfig {
     /// The model's ONNX file.

@@ -10,6 +10,7 @@ use nalgebra::Point2;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Rect, Scalar, Size, ToInputArray, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zxingcpp::{Barcode, BarcodeFormat, BarcodeReader, ImageFormat, ImageView};
 
@@ -17,7 +18,7 @@ use super::{Detect, DetectError};
 use crate::camera::frame::CameraFrame;
 
 /// Configuration of the placard detector.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlacardConfig {
     /// Enlargements of the frame, cheapest first. Default 1x1, 2x2 and 4x2. Trade-off: more passes
@@ -28,7 +29,7 @@ pub struct PlacardConfig {
 }
 
 /// One reading of the frame, enlarged by cubic interpolation.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Pass {
     /// Horizontal enlargement, 1 to 4. Slanted views make codes narrow, so this is usually the

@@ -12,6 +12,7 @@
 use std::path::{Path, PathBuf};
 
 use ecod::model::detection::{Detection, parse_detections};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
@@ -19,7 +20,7 @@ use crate::camera::frame::CameraFrame;
 use crate::platform::bounded_file;
 
 /// Source of recorded detections.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedConfig {
     /// The JSON Lines file.

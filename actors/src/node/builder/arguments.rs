@@ -413,7 +413,9 @@ impl NodeBuilder {
                 .iter()
                 .map(|camera| camera.name.clone())
                 .collect(),
+            pictures: Vec::new(),
             floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
+            origin: self.config.origin,
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
@@ -429,6 +431,7 @@ impl NodeBuilder {
             frames: self.frames(),
             live_state: Arc::clone(&self.live_state),
             cameras: self.vehicle.shown_cameras.clone(),
+            further_cameras: self.vehicle.further_cameras.subscribe(),
             floor_plan: self.floor_plan.clone(),
         };
         DashboardArguments {

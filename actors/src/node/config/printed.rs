@@ -5,6 +5,7 @@ use figment::providers::Serialized;
 use toml::{Table, Value};
 
 use super::NodeConfig;
+use super::descriptions::{KeyDescriptions, TableDescriptions};
 
 impl NodeConfig {
     /// The configuration as TOML that can be read back. Secrets are left out, and a comment marks
@@ -22,10 +23,29 @@ impl NodeConfig {
     /// # Errors
     /// Returns an error if a value has no form in TOML.
     pub fn to_toml_changed(&self) -> Result<String, toml::ser::Error> {
+        let (keys, comment) = self.changed_keys()?;
+        Ok(comment + &toml::to_string(&keys)?)
+    }
+
+    /// The configuration as [`Self::to_toml_changed`] writes it, with a comment of one line on each
+    /// key.
+    ///
+    /// # Errors
+    /// Returns an error if a value has no form in TOML.
+    pub fn to_toml_commented(&self) -> Result<String, toml::ser::Error> {
+        let (keys, comment) = self.changed_keys()?;
+        let descriptions = KeyDescriptions::new();
+        let mut text = comment;
+        write_table(&mut text, "", &keys, &descriptions.root(&keys))?;
+        Ok(text)
+    }
+
+    /// The keys whose values differ from the defaults, and a comment on missing secrets.
+    fn changed_keys(&self) -> Result<(Table, String), toml::ser::Error> {
         let (shown, comment) = self.without_secrets();
         let mut keys = Table::try_from(&shown)?;
         remove_defaults(&mut keys, &mut Vec::new(), &shown);
-        Ok(comment + &toml::to_string(&keys)?)
+        Ok((keys, comment))
     }
 
     /// The configuration without secrets, and a comment on each that is missing.
@@ -66,6 +86,57 @@ impl NodeConfig {
             }
         }
         (shown, comment)
+    }
+}
+
+/// Writes the keys of a table, each below its description, and then the tables in it. `path` is the
+/// table's name, empty for the root.
+fn write_table(
+    text: &mut String,
+    path: &str,
+    table: &Table,
+    descriptions: &TableDescriptions<'_>,
+) -> Result<(), toml::ser::Error> {
+    let comment = |text: &mut String, key: &str| {
+        if let Some(sentence) = descriptions.of(key) {
+            *text += &format!("# {sentence}\n");
+        }
+    };
+    for (key, value) in table {
+        if tables_of(value).is_none() {
+            comment(text, key);
+            *text += &toml::to_string(&Table::from_iter([(key.clone(), value.clone())]))?;
+        }
+    }
+    for (key, value) in table {
+        let name = toml::to_string(&Table::from_iter([(key.clone(), true.into())]))?;
+        let name = name.trim_end().trim_end_matches("= true").trim_end();
+        let path = match path {
+            "" => name.to_owned(),
+            above => format!("{above}.{name}"),
+        };
+        for inner in tables_of(value).into_iter().flatten() {
+            let is_only_above = !inner.is_empty() && inner.values().all(Value::is_table);
+            if value.is_array() || !is_only_above {
+                text.push('\n');
+                comment(text, key);
+                *text += &match value {
+                    Value::Array(_) => format!("[[{path}]]\n"),
+                    _ => format!("[{path}]\n"),
+                };
+            }
+            write_table(text, &path, inner, &descriptions.within(key, inner))?;
+        }
+    }
+    Ok(())
+}
+
+/// The table of a value, or the tables of an array of tables; `None` for other values.
+fn tables_of(value: &Value) -> Option<Vec<&Table>> {
+    match value {
+        Value::Table(table) => Some(vec![table]),
+        Value::Array(values) if !values.is_empty() => values.iter().map(Value::as_table).collect(),
+        _ => None,
     }
 }
 

@@ -13,7 +13,7 @@ const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const SVG: &str = "image/svg+xml";
 
-const ASSETS: [Asset; 19] = [
+const ASSETS: [Asset; 21] = [
     asset("/", HTML, include_str!("page/index.html")),
     asset("/view.css", CSS, VIEW_STYLE),
     asset("/style.css", CSS, include_str!("page/style.css")),
@@ -26,6 +26,8 @@ const ASSETS: [Asset; 19] = [
     asset("/timeline.js", SCRIPT, include_str!("page/timeline.js")),
     asset("/map.js", SCRIPT, include_str!("page/map.js")),
     asset("/fit.js", SCRIPT, include_str!("page/fit.js")),
+    asset("/labels.js", SCRIPT, include_str!("page/labels.js")),
+    asset("/earth.js", SCRIPT, include_str!("page/earth.js")),
     asset("/floor.js", SCRIPT, include_str!("page/floor.js")),
     asset("/trails.js", SCRIPT, include_str!("page/trails.js")),
     asset("/details.js", SCRIPT, include_str!("page/details.js")),
@@ -68,11 +70,13 @@ pub(crate) fn view() -> &'static str {
 /// The scripts that draw map and timeline, as one script without imports. Their top-level names
 /// must be distinct.
 pub(crate) fn view_script() -> String {
-    const PATHS: [&str; 10] = [
+    const PATHS: [&str; 12] = [
         "/dom.js",
         "/scene.js",
         "/terms.js",
         "/fit.js",
+        "/labels.js",
+        "/earth.js",
         "/floor.js",
         "/trails.js",
         "/details.js",

@@ -24,7 +24,7 @@ impl CameraFeed {
     }
 
     /// Number of browsers that show the pictures.
-    pub(crate) fn viewers(&self) -> usize {
+    fn viewers(&self) -> usize {
         self.pictures.receiver_count()
     }
 

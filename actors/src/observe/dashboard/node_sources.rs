@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::model::names::{Label, LandmarkId, NodeName};
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
@@ -36,6 +37,8 @@ pub struct NodeSources {
     pub live_state: Arc<LiveState>,
     /// The node's cameras, if their pictures are shown.
     pub cameras: Vec<ShownCamera>,
+    /// Cameras of other nodes of this process, if their pictures are shown, too.
+    pub further_cameras: watch::Receiver<Vec<ShownCamera>>,
     /// Image under the map.
     pub floor_plan: Option<FloorPlan>,
 }
@@ -68,9 +71,15 @@ pub struct NodeFacts {
     /// Names of these cameras, in their order; `None` for the camera without a name, which is the
     /// first.
     pub cameras: Vec<Option<String>>,
+    /// Names under which the cameras of `/api/cameras` report: the node's cameras in their order,
+    /// and then the cameras of other nodes of its process.
+    pub pictures: Vec<NodeName>,
     /// The image under the map, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub floor_plan: Option<FloorPlanFacts>,
+    /// Place of the cell's frame on Earth; absent without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub origin: Option<GeographicOrigin>,
     /// Version of the software.
     pub version: &'static str,
     /// Start of the node in Unix microseconds by its clock.
@@ -91,10 +100,17 @@ impl NodeSources {
     /// The current facts about the node.
     pub(crate) fn node_facts(&self) -> NodeFacts {
         let credentials = self.vitals.security.credentials.as_ref();
+        let shared = self.vitals.shared.borrow();
         NodeFacts {
             certificate_ends_us: credentials
                 .map(|credentials| credentials.current().identity.expires()),
-            round_period_s: self.vitals.shared.borrow().round_period_s,
+            round_period_s: shared.round_period_s,
+            origin: shared.origin,
+            pictures: self
+                .pictured_cameras()
+                .into_iter()
+                .map(|camera| camera.reporter)
+                .collect(),
             ..self.node.clone()
         }
     }
@@ -106,12 +122,10 @@ impl NodeSources {
             .find(|camera| name.is_none() || camera.name.as_deref() == name)
     }
 
-    /// Number of browsers that show pictures of a camera.
-    pub(crate) fn camera_viewers(&self) -> usize {
-        self.cameras
-            .iter()
-            .map(|camera| camera.feed.viewers())
-            .sum()
+    /// All cameras whose pictures the page shows, the node's own first.
+    pub(crate) fn pictured_cameras(&self) -> Vec<ShownCamera> {
+        let further = self.further_cameras.borrow();
+        self.cameras.iter().chain(&*further).cloned().collect()
     }
 
     /// Landmarks of the cell.

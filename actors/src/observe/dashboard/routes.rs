@@ -18,11 +18,9 @@ use axum::{Json, Router};
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use futures_util::stream;
+use futures_util::{Stream, StreamExt, stream};
 use serde::Serialize;
-#[cfg(feature = "camera")]
-use tokio::sync::Semaphore;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 #[cfg(feature = "camera")]
 use tokio::task::spawn_blocking;
 #[cfg(feature = "camera")]
@@ -46,7 +44,8 @@ use crate::telemetry::counters::Event;
 pub(crate) struct HttpApi {
     monitor: Arc<NodeMonitor>,
     metrics: ResponseCache<Result<Bytes, fmt::Error>>,
-    max_viewers: usize,
+    /// One permit for each connection that stays open.
+    streams: Arc<Semaphore>,
     /// One mount is fitted at a time.
     #[cfg(feature = "camera")]
     mounts: Arc<Semaphore>,
@@ -72,7 +71,7 @@ impl HttpApi {
     pub(crate) fn new(monitor: Arc<NodeMonitor>, max_connections: usize) -> Self {
         Self {
             metrics: ResponseCache::new(METRICS_MIN_AGE),
-            max_viewers: max_connections / 2,
+            streams: Arc::new(Semaphore::new(max_connections / 2)),
             #[cfg(feature = "camera")]
             mounts: Arc::new(Semaphore::new(1)),
             monitor,
@@ -91,6 +90,7 @@ impl HttpApi {
             .route("/api/landmarks", get(show_landmarks))
             .route("/api/events", get(show_events))
             .route("/api/camera", get(show_camera))
+            .route("/api/cameras", get(show_cameras))
             .route(floor_plan::PATH, get(show_floor_plan))
             .fallback(show_asset);
         #[cfg(feature = "camera")]
@@ -116,11 +116,6 @@ impl HttpApi {
         self.monitor.sources.counters.count(event);
     }
 
-    /// True if no further connection may stay open.
-    fn is_crowded(&self) -> bool {
-        self.monitor.viewers() + self.monitor.sources.camera_viewers() >= self.max_viewers
-    }
-
     /// The camera of `?name=`, or the first; else an answer with the names.
     fn camera(&self, uri: &Uri) -> Result<&ShownCamera, (StatusCode, String)> {
         let sources = &self.monitor.sources;
@@ -142,9 +137,17 @@ impl HttpApi {
         })
     }
 
-    fn refuse_viewer(&self) -> Response {
-        self.count(Event::BrowserRefused);
-        (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response()
+    /// Server-sent events on a connection that stays open, unless there are too many of these.
+    fn stream(&self, events: impl Stream<Item = Bytes> + Send + 'static) -> Response {
+        let Ok(permit) = Arc::clone(&self.streams).try_acquire_owned() else {
+            self.count(Event::BrowserRefused);
+            return (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response();
+        };
+        let events = events.map(move |event| {
+            let _held = &permit;
+            Ok::<Bytes, Infallible>(event)
+        });
+        typed("text/event-stream", Body::from_stream(events))
     }
 }
 
@@ -258,20 +261,38 @@ async fn show_landmarks(State(api): Api) -> Response {
 
 /// Snapshots as they are taken. A browser that is too slow for one gets the next.
 async fn show_events(State(api): Api) -> Response {
-    if api.is_crowded() {
-        return api.refuse_viewer();
-    }
-    let snapshots = api.monitor.snapshots();
-    stream_events(snapshots, Some(api.monitor.event()))
+    let monitor = &api.monitor;
+    api.stream(latest(monitor.snapshots(), Some(monitor.event())))
 }
 
 /// Pictures of a camera of the node as they are taken.
 async fn show_camera(State(api): Api, uri: Uri) -> Response {
     match api.camera(&uri) {
-        Ok(_) if api.is_crowded() => api.refuse_viewer(),
-        Ok(camera) => stream_events(camera.feed.pictures(), None),
+        Ok(camera) => api.stream(latest(camera.feed.pictures(), None)),
         Err(refusal) => refusal.into_response(),
     }
+}
+
+/// Pictures of all cameras on one connection, because a browser opens only a few to a host;
+/// `?of=` selects one camera. The `id` of each event is the name under which the camera reports.
+/// The stream ends when the cameras of other nodes change, and a browser connects again.
+async fn show_cameras(State(api): Api, uri: Uri) -> Response {
+    let sources = &api.monitor.sources;
+    let mut further = sources.further_cameras.clone();
+    further.mark_unchanged();
+    let wanted = value_in(&uri, "of=");
+    let mut cameras = sources.pictured_cameras();
+    cameras.retain(|camera| wanted.is_none_or(|name| camera.reporter.as_str() == name));
+    if cameras.is_empty() {
+        return (StatusCode::NOT_FOUND, "no such camera\n").into_response();
+    }
+    let pictures = cameras.into_iter().map(|camera| {
+        let id = format!("id: {}\n", camera.reporter);
+        latest(camera.feed.pictures(), None)
+            .map(move |picture| Bytes::from([id.as_bytes(), &picture].concat()))
+            .boxed()
+    });
+    api.stream(stream::select_all(pictures).take_until(async move { further.changed().await }))
 }
 
 /// The mount of a camera, from points that were clicked. Other sites' pages cannot send this
@@ -333,10 +354,13 @@ async fn show_floor_plan(State(api): Api) -> Response {
     }
 }
 
-/// Server-sent events: the first, and then the latest whenever the browser has room.
-fn stream_events(mut events: watch::Receiver<Bytes>, first: Option<Bytes>) -> Response {
+/// The first event, and then the latest whenever there is room.
+fn latest(
+    mut events: watch::Receiver<Bytes>,
+    first: Option<Bytes>,
+) -> impl Stream<Item = Bytes> + Send + 'static {
     events.mark_unchanged();
-    let events = stream::unfold((events, first), |(mut events, mut first)| async move {
+    stream::unfold((events, first), |(mut events, mut first)| async move {
         let event = match first.take() {
             Some(event) => event,
             None => {
@@ -344,9 +368,8 @@ fn stream_events(mut events: watch::Receiver<Bytes>, first: Option<Bytes>) -> Re
                 events.borrow_and_update().clone()
             }
         };
-        Some((Ok::<Bytes, Infallible>(event), (events, first)))
-    });
-    typed("text/event-stream", Body::from_stream(events))
+        Some((event, (events, first)))
+    })
 }
 
 async fn show_asset(uri: Uri) -> Response {

@@ -1,6 +1,7 @@
 //! Families of exported models, and how each arranges its outputs.
 
 use ecod::model::detection::BoundingBox;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::labels::Classes;
@@ -10,7 +11,7 @@ use crate::camera::detect::candidates::ScoredBox;
 use crate::camera::image_size::ImageSize;
 
 /// Family of a model, by the project that exported it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
 pub enum Family {
@@ -31,7 +32,7 @@ pub enum Family {
 }
 
 /// Values that a network takes for the levels 0 to 255 of a pixel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Normalization {
     /// 0 to 255.

@@ -1,5 +1,7 @@
 // Fit of the map: bounds that ignore a few distant objects, and signs at the border for what lies outside.
 
+import { SURE_FROM, sureness } from "./scene.js";
+
 const MARGIN_PX = 46;
 /// Maximum pixels per metre without zoom.
 const MAX_SCALE = 4000;
@@ -10,12 +12,16 @@ const FAR_GAIN = 3;
 const CUE_PX = 14;
 const SECTORS = 12;
 
-/// Bounds in metres: west, south, east, north. Vehicles that see nothing of the map, and raw detections, which are less
-/// certain, count only where there is little else. Without `all`, far points are left out where the map gains by it.
+/// Bounds in metres: west, south, east, north. Unsure objects, vehicles that see nothing of the map, and raw detections,
+/// which are less certain, count only where there is little else. Without `all`, far points are left out where the map
+/// gains by it.
 export function bounds({ places, objects, vehicles }, plan, box, all) {
   const looking = vehicles.filter((v) => v.objects.length + v.seen.length > 0);
-  const sure = [...places, ...objects, ...looking.map((v) => v.pose)].filter(Boolean);
-  const points = sure.length > 1 || plan ? sure : [...sure, ...vehicles.map((v) => v.pose).filter(Boolean), ...vehicles.flatMap((v) => v.objects)];
+  const counting = all ? objects : objects.filter((object) => sureness(object) >= SURE_FROM);
+  const sure = [...places, ...counting, ...looking.map((v) => v.pose)].filter(Boolean);
+  const unsure = [...objects, ...vehicles.map((v) => v.pose).filter(Boolean)];
+  const more = [unsure, vehicles.flatMap((v) => v.objects)];
+  const points = more.reduce((few, further) => (few.length > 1 || plan ? few : [...few, ...further]), sure);
   if (points.length === 0) return plan ?? [0, 0, 0, 0];
   const [x, y] = ["x_m", "y_m"].map((axis) => points.map((p) => p[axis]).sort((a, b) => a - b)[points.length >> 1]);
   const far = (p) => Math.hypot(p.x_m - x, p.y_m - y);

@@ -74,8 +74,8 @@ function drawPicture() {
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
   map.floor.take(picture.node.floor_plan).catch((error) => (faults["floor plan"] = error));
-  if (!map.asTable) map.draw(shown, mount.onMap);
-  camera.draw(picture.node, scene, map.lit);
+  if (!map.asTable) map.draw({ ...shown, origin: picture.node.origin ?? null }, mount.onMap);
+  camera.draw(picture.node, picture.nodes, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;
   if (map.asTable) tables.places(shown);
   drawText(picture, scene);

@@ -1,9 +1,12 @@
-// Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
+// Bird's-eye view: world metres to screen pixels, symbols of constant size. Unsure objects are pale or hidden.
 
-import { details, ellipse, showDetails, sightings } from "./details.js";
-import { byId, keyed, percent, set, span, svg, text } from "./dom.js";
+import { details, ellipse, position, showDetails, sightings } from "./details.js";
+import { byId, counted, keyed, percent, set, span, svg, text } from "./dom.js";
+import { inDegrees, northOf } from "./earth.js";
 import { bounds, cues, fitting, union } from "./fit.js";
 import { FloorPlan } from "./floor.js";
+import { Labels } from "./labels.js";
+import { HIDDEN_BELOW, SURE_FROM, sureness } from "./scene.js";
 import { Trails } from "./trails.js";
 
 /// Maximum number of drawn places, and of objects; the table has all.
@@ -21,6 +24,11 @@ const DRAG_PX = 4;
 const VAST_PX = 150;
 /// Radius in pixels around an object in which it is pointed at.
 const REACH_PX = 11;
+/// Place of the north arrow above the lower left corner, and its length, in pixels.
+const NORTH_PX = [26, 56];
+const NORTH_LENGTH_PX = 15;
+/// Ranks of labels: a label of a higher rank takes its place before others. Objects have 1 and their sureness.
+const RANKS = { lit: 6, pick: 5, vehicle: 4, cue: 3, place: 2, object: 1, free: 0 };
 
 export class BirdsEye {
   #picture = byId("map");
@@ -38,6 +46,12 @@ export class BirdsEye {
   #dragged = false;
   #onPick = null;
   #known = [];
+  #labels = new Labels();
+  /// Whether objects are shown that are too unsure.
+  #showsUnsure = false;
+  /// The mouse on the map in pixels, or null, and the origin of the frame.
+  #pointer = null;
+  #origin = null;
   /// Whether a table is shown in the place of the map.
   asTable = false;
   /// Name of the symbol that is pointed at, here or elsewhere: its kind and identity.
@@ -58,6 +72,10 @@ export class BirdsEye {
     byId("zoom-in").onclick = () => this.#zoomBy(1.4);
     byId("zoom-out").onclick = () => this.#zoomBy(1 / 1.4);
     byId("fit").onclick = () => this.#fit();
+    byId("map-unsure").onclick = () => {
+      this.#showsUnsure = !this.#showsUnsure;
+      redraw();
+    };
     byId("as-table").onclick = ({ target }) => {
       this.asTable = !this.asTable;
       byId("map-table").hidden = !this.asTable;
@@ -72,6 +90,7 @@ export class BirdsEye {
       this.#zoomBy(event.deltaY < 0 ? 1.15 : 1 / 1.15);
     }, { passive: false });
     this.#drag();
+    this.#readOff();
     new ResizeObserver(redraw).observe(this.#picture);
   }
 
@@ -81,26 +100,32 @@ export class BirdsEye {
     this.#picture.classList.toggle("picking", onPick !== null);
   }
 
-  /// Draws { places, objects, vehicles, now, fused_at }, and `picks`, numbered points in metres.
-  draw(scene, picks = []) {
+  /// Draws { places, objects, vehicles, now, fused_at, origin }, and `picks`, numbered points in metres. The north arrow
+  /// needs an origin, or null for a frame that has none; it is left out where that is unknown.
+  draw(all, picks = []) {
     const box = this.#picture.getBoundingClientRect();
-    const empty = scene.places.length + scene.objects.length + scene.vehicles.length === 0;
+    const empty = all.places.length + all.objects.length + all.vehicles.length === 0;
+    const scene = { ...all, objects: this.#sureEnough(all.objects) };
     byId("map-empty").hidden = !empty || this.floor.bounds !== null;
     if (Math.min(box.width, box.height) <= MIN_BOX_PX || (empty && !this.floor.bounds)) return;
-    set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
+    set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene, all.objects.length - scene.objects.length) });
     this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
     const at = this.#projection({ ...scene, places: [...scene.places, ...picks] }, box);
-    [this.#at, this.#known] = [at, scene.places];
-    const labels = new Labels(box);
+    [this.#at, this.#known, this.#origin] = [at, scene.places, scene.origin];
+    const labels = this.#labels;
+    labels.begin(box, this.#picture);
     this.floor.draw(at);
-    this.#grid(at, box);
+    this.#grid(at, box, scene.origin, labels);
     this.#move(scene, at);
     this.#picks(picks, at, labels);
     this.#places(scene.places.slice(0, MAX_DRAWN), at, labels);
-    this.#objects(scene.objects.slice(0, MAX_DRAWN), at, labels);
+    const posed = new Set(scene.vehicles.filter((v) => v.pose).map((v) => v.node));
+    this.#objects(scene.objects.slice(0, MAX_DRAWN), posed, at, labels);
     this.#vehicles(scene.vehicles, scene.now, at, labels);
     this.#cues(scene, at, box, labels);
-    this.#details(scene, at, box);
+    this.#details(all, at, box);
+    this.#tellPointer();
+    labels.place();
     keyed(this.#layers.labels, labels.placed, (label) => label.key, () => svg("text"), (element, label) => {
       set(element, { x: label.x, y: label.y, "text-anchor": label.anchor, class: label.class });
       text(element, label.text);
@@ -129,7 +154,19 @@ export class BirdsEye {
     this.#bounds = now - this.#fullAt > ROOMY_MS ? needed : grown;
   }
 
-  #grid(at, box) {
+  /// Objects that are sure enough to be shown, and those that are pointed at or chosen, here or in a picture.
+  #sureEnough(objects) {
+    const isUnsure = (object) => sureness(object) < HIDDEN_BELOW;
+    const unsure = objects.filter(isUnsure).length;
+    const button = byId("map-unsure");
+    button.hidden = unsure === 0;
+    button.setAttribute("aria-pressed", String(this.#showsUnsure));
+    text(button, `${counted(unsure, "unsure object")} ${this.#showsUnsure ? "shown, hide" : "hidden, show"}`);
+    if (this.#showsUnsure) return objects;
+    return objects.filter((object) => !isUnsure(object) || [this.lit, this.#kept].includes(`object ${object.id}`));
+  }
+
+  #grid(at, box, origin, labels) {
     const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(80 / at.scale))).find((n) => n * at.scale >= 70);
     const [zeroX, zeroY] = at({ x_m: 0, y_m: 0 });
     const lines = [];
@@ -140,13 +177,51 @@ export class BirdsEye {
     keyed(this.#layers.scale, [0], () => 0, () => {
       const g = svg("g");
       g.append(svg("path", { class: "rule" }), svg("text", { class: "scale dim" }));
+      const north = g.appendChild(svg("g", { class: "north" }));
+      north.append(svg("path", { d: "M0 -11L5 7L0 3L-5 7Z" }), svg("text", { "text-anchor": "middle" }));
+      text(north.lastChild, "N");
       return g;
     }, (g) => {
       const y = box.height - 12;
-      set(g.firstChild, { d: `M12 ${y - 5}v5h${px.toFixed(1)}v-5` });
-      set(g.lastChild, { x: 18 + px, y });
-      text(g.lastChild, step >= 1 ? `${step} m` : `${+(step * 100).toFixed(1)} cm`);
+      const [rule, length, north] = g.children;
+      set(rule, { d: `M12 ${y - 5}v5h${px.toFixed(1)}v-5` });
+      set(length, { x: 18 + px, y });
+      text(length, step >= 1000 ? `${step / 1000} km` : step >= 1 ? `${step} m` : `${+(step * 100).toFixed(1)} cm`);
+      labels.reserve([8, y - 14, 70 + px, box.height]);
+      this.#north(north, origin, box, labels);
     });
+  }
+
+  /// Points to north; "N" stands at the tip, upright.
+  #north(arrow, origin, box, labels) {
+    set(arrow, { visibility: origin === undefined ? "hidden" : "visible" });
+    if (origin === undefined) return;
+    const [x, y] = [NORTH_PX[0], box.height - NORTH_PX[1]];
+    const angle = (northOf(origin) * Math.PI) / 180;
+    const reach = NORTH_LENGTH_PX + 4;
+    set(arrow.firstChild, { transform: `translate(${x} ${y}) rotate(${northOf(origin).toFixed(1)})` });
+    set(arrow.lastChild, { x: x + reach * Math.sin(angle), y: y - reach * Math.cos(angle) + 4 });
+    labels.reserve([x - 24, y - 28, x + 24, y + 24]);
+  }
+
+  /// Shows the position at the mouse, or where a finger touched.
+  #readOff() {
+    const take = (event) => {
+      const { left, top } = this.#picture.getBoundingClientRect();
+      this.#pointer = event && [event.clientX - left, event.clientY - top];
+      this.#tellPointer();
+    };
+    for (const kind of ["pointermove", "pointerdown"]) this.#picture.addEventListener(kind, take);
+    this.#picture.addEventListener("pointerleave", ({ pointerType }) => pointerType !== "touch" && take(null));
+  }
+
+  #tellPointer() {
+    if (!this.#pointer || !this.#at) return text(byId("map-at"), "Point at the map for coordinates");
+    const { scale, back } = this.#at;
+    const place = back(...this.#pointer);
+    const decimals = scale >= 100 ? 2 : scale >= 5 ? 1 : 0;
+    const words = position(place, this.#origin, decimals);
+    text(byId("map-at"), this.#origin ? `${words}; ${inDegrees(place, this.#origin, decimals + 5)}` : words);
   }
 
   #places(places, at, labels) {
@@ -163,11 +238,12 @@ export class BirdsEye {
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
       set(sign, { x: x - 5.5, y: y - 5.5, class: `place ${place.state}` });
-      labels.put(`place ${place.id}`, place.label ?? place.id, x, y, 9, place.label ? "" : "dim");
+      const [rank, style] = place.label ? [RANKS.place, ""] : [RANKS.free, "dim"];
+      labels.put({ key: `place ${place.id}`, rank, words: place.label ?? place.id, x, y, gap: 9, style });
     });
   }
 
-  #objects(objects, at, labels) {
+  #objects(objects, vehicles, at, labels) {
     keyed(this.#layers.objects, objects, (object) => object.id, () => {
       const g = svg("g");
       g.append(svg("line", { class: "motion" }), svg("ellipse"), svg("circle", { class: "reach", r: REACH_PX }), svg("circle", { class: "centre", r: 2.5 }));
@@ -184,10 +260,15 @@ export class BirdsEye {
       set(around, { class: a * at.scale > VAST_PX ? "ellipse vast" : "ellipse", rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       for (const circle of [reach, centre]) set(circle, { cx: x, cy: y });
       const age = object.age_s ?? 0;
-      const style = `${age > OLD_S ? "old" : ""} ${this.#light(g, `object ${object.id}`)}`.trim();
+      const name = `object ${object.id}`;
+      const isUnsure = sureness(object) < SURE_FROM;
+      const paleness = `${age > OLD_S ? "old" : ""} ${isUnsure ? "unsure" : ""}`.trim();
+      const lit = this.#light(g, name);
       // The vehicle's own symbol is reached instead.
-      set(g, { class: style, tabindex: object.vehicle ? -1 : 0, "aria-label": `${object.vehicle ?? object.label}, ${percent(object.confidence)}, seen ${sightings(object)}` });
-      labels.put(`object ${object.id}`, aged(object.vehicle ?? object.label, age), x, y, 9, age > OLD_S ? "old" : "");
+      const what = object.vehicle ?? object.label;
+      set(g, { class: `${paleness} ${lit}`.trim(), tabindex: object.vehicle ? -1 : 0, "aria-label": `${what}, ${percent(object.confidence)}, ${isUnsure ? "unsure, " : ""}seen ${sightings(object)}` });
+      // The vehicle's own symbol has the name.
+      if (!vehicles.has(object.vehicle)) labels.put({ key: name, rank: lit ? RANKS.lit : RANKS.object + sureness(object), words: aged(what, age), x, y, gap: 9, style: paleness });
     });
   }
 
@@ -239,7 +320,7 @@ export class BirdsEye {
     keyed(this.#layers.picks, picks, (pick) => pick.number, () => svg("path", { class: "pick", d: "M-7 0H7M0 -7V7" }), (path, pick) => {
       const [x, y] = at(pick);
       set(path, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` });
-      labels.put(`pick ${pick.number}`, String(pick.number), x, y, 9, "pick");
+      labels.put({ key: `pick ${pick.number}`, rank: RANKS.pick, words: String(pick.number), x, y, gap: 9, style: "pick" });
     });
   }
 
@@ -252,7 +333,7 @@ export class BirdsEye {
     const outside = cues(things, at, box);
     keyed(this.#layers.cues, outside, (cue) => cue.sector, () => svg("path", { class: "cue", d: "M8 0L-6 7L-2 0L-6 -7Z" }), (path, cue) => {
       set(path, { transform: `translate(${cue.x.toFixed(1)} ${cue.y.toFixed(1)}) rotate(${cue.degrees.toFixed(1)})` });
-      labels.put(`cue ${cue.sector}`, cue.words, cue.x, cue.y, 12, "cue");
+      labels.put({ key: `cue ${cue.sector}`, rank: RANKS.cue, words: cue.words, x: cue.x, y: cue.y, gap: 12, style: "cue" });
     });
     const count = outside.reduce((sum, cue) => sum + cue.count, 0);
     byId("map-outside").hidden = count === 0;
@@ -281,7 +362,7 @@ export class BirdsEye {
       set(g.firstChild, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       const age = (now - v.received_at_us) / 1e6;
       set(g, { "aria-label": `${v.node}, a vehicle` });
-      labels.put(`vehicle ${v.node}`, aged(v.node, age), x, y, 14, `vehicle c${v.colour} ${old(v)}`);
+      labels.put({ key: `vehicle ${v.node}`, rank: RANKS.vehicle, words: aged(v.node, age), x, y, gap: 14, style: `vehicle c${v.colour} ${old(v)}` });
     });
   }
 
@@ -364,32 +445,8 @@ const aged = (name, age) => (age > OLD_S ? `${name}, ${span(age)}` : name);
 const turn = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 /// Description of the map for screen readers.
-function describe({ places, objects, vehicles }) {
+function describe({ places, objects, vehicles }, hidden) {
   const labelled = places.filter((place) => place.label).length;
-  return `Map of ${places.length} places, ${labelled} with a label, ${objects.length} other objects and ${vehicles.length} vehicles`;
-}
-
-/// Places labels beside their symbols without overlap; a label without room is omitted.
-class Labels {
-  placed = [];
-  #taken = [];
-
-  constructor(box) {
-    this.box = box;
-  }
-
-  put(key, words, x, y, gap, style) {
-    const shown = words.length > 18 ? words.slice(0, 17) + "…" : words;
-    const width = shown.length * 7 + 4;
-    const places = [["start", x + gap, y + 4], ["end", x - gap, y + 4], ["middle", x, y - gap - 2], ["middle", x, y + gap + 11]];
-    for (const [anchor, lx, ly] of places) {
-      const left = anchor === "start" ? lx : anchor === "end" ? lx - width : lx - width / 2;
-      const area = [left, ly - 11, left + width, ly + 3];
-      const outside = area[0] < 0 || area[2] > this.box.width || area[1] < 0 || area[3] > this.box.height;
-      if (outside || this.#taken.some((t) => area[0] < t[2] && area[2] > t[0] && area[1] < t[3] && area[3] > t[1])) continue;
-      this.#taken.push(area);
-      this.placed.push({ key, text: shown, x: lx, y: ly, anchor, class: style });
-      return;
-    }
-  }
+  const unsure = hidden > 0 ? `, without ${counted(hidden, "unsure object")}` : "";
+  return `Map of ${places.length} places, ${labelled} with a label, ${objects.length} other objects and ${vehicles.length} vehicles${unsure}`;
 }

@@ -48,8 +48,9 @@ export class MountPoints {
     this.#lists.set(this.#camera, points);
   }
 
-  /// Follows another camera.
+  /// Follows another camera; undefined if no camera of the node is shown alone.
   choose(camera) {
+    if (camera === undefined) return this.#follow(false);
     [this.#camera, this.#size] = [camera, null];
     this.draw();
   }

@@ -3,6 +3,13 @@
 /// Colours by name, in alphabetical order.
 export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
 
+/// Probability of existence below which an object of the map is hidden, and below which it is pale and does not count for the fit.
+export const HIDDEN_BELOW = 0.3;
+export const SURE_FROM = 0.5;
+
+/// Probability that an object exists. A map of tracks states it apart from the confidence, which includes the position's.
+export const sureness = ({ existence, confidence }) => existence ?? confidence;
+
 export const list = (names) => (names.length > 3 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(", ") || "–");
 
 /// Scene of the map: a snapshot, or the map at an earlier time, joined with known locations and colours by name.

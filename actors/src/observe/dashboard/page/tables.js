@@ -72,7 +72,7 @@ export function verdicts(received, now) {
 const REFUSALS = ["untimely", "malformed", "not_permitted"];
 
 /// Address of a node's page, if a browser here may reach it.
-const pageOf = (page) => (page ? `http://${page}/` : undefined);
+export const pageOf = (page) => (page ? `http://${page}/` : undefined);
 
 export function vehicles(entries, now, { troubles, nodes }) {
   const pages = new Map(nodes.map(({ name, page }) => [name, page]));
