@@ -10,7 +10,9 @@
 //!
 //! Streets and rows of parked cars look alike after half a turn or a mirror, so that observers with
 //! separate views might coincide by chance. A change therefore counts only if no other change, and
-//! no shift of the same change, explains half as many objects, and if three windows agree.
+//! no shift of the same change, explains half as many objects, and if three windows agree. Two
+//! other vehicles must have reported explained objects; the only other one suffices if the change is
+//! about the observer's own position.
 
 mod comparison;
 mod isometry;
@@ -34,21 +36,33 @@ use crate::wire::ObjectReport;
 /// Time between two comparisons of an observer.
 const INTERVAL: Duration = Duration::from_secs(1);
 
+/// Maximum number of other vehicles in a comparison, and of parts of each.
+const MAX_OTHERS: usize = 16;
+const MAX_PARTS_COMPARED: usize = 4;
+
+/// Maximum time between the captures of two reports that are compared.
+const SIMULTANEOUS: Duration = Duration::from_millis(200);
+
+/// Minimum time between the judgements of two windows, which cost some milliseconds each. Until
+/// then, a complete window moves on with new reports.
+const JUDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
+
 /// Number of windows that must agree.
 const MIN_WINDOWS: u32 = 3;
 
 /// Time after which a mistake that no further window shows is over.
-const LASTS: Duration = Duration::from_secs(60);
+const MISTAKE_MEMORY: Duration = Duration::from_secs(60);
 
 /// Maximum number of observers that are compared, and the time after which a silent observer makes
 /// room.
 const MAX_OBSERVERS: usize = 256;
-const SILENT: Duration = Duration::from_secs(10);
+const OBSERVER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Compares the observers of a cell with each other.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Conventions {
     observers: BTreeMap<NodeName, ComparedObserver>,
+    judged_at: Timestamp,
 }
 
 /// The latest report of an observer or of a part of a vehicle, and its comparison with others.
@@ -94,14 +108,14 @@ impl Conventions {
     /// The mistake that explains the reports of an observer, if there is one.
     pub(super) fn misreading(&self, node: &NodeName, now: Timestamp) -> Option<&Misreading> {
         let suspected = self.observers.get(node)?.suspected.as_ref()?;
-        let is_present = now.since(suspected.shown_at) < LASTS;
+        let is_present = now.since(suspected.shown_at) < MISTAKE_MEMORY;
         (suspected.windows >= MIN_WINDOWS && is_present).then_some(&suspected.misreading)
     }
 
     fn has_room(&mut self, now: Timestamp) -> bool {
         if self.observers.len() >= MAX_OBSERVERS {
             self.observers
-                .retain(|_, observer| now.since(observer.captured_at) < SILENT);
+                .retain(|_, observer| now.since(observer.captured_at) < OBSERVER_TIMEOUT);
         }
         self.observers.len() < MAX_OBSERVERS
     }
@@ -126,9 +140,8 @@ impl Conventions {
             .filter(|other| !other.objects.is_empty())
             .collect();
         simultaneous.sort_by(|one, other| distance_m(one).total_cmp(&distance_m(other)));
-        let nearest = simultaneous.into_iter().take(MAX_OTHERS);
-        let others: Vec<_> = nearest.map(PlacedReport::of).collect();
-        let own = PlacedReport::of(report);
+        let others = witnesses(simultaneous);
+        let is_due = at.since(self.judged_at) >= JUDGEMENT_INTERVAL;
         let Some(observer) = self
             .observers
             .get_mut(&report.node)
@@ -136,26 +149,48 @@ impl Conventions {
         else {
             return;
         };
-        match observer.comparison.add(own, &others) {
-            Some(WindowOutcome::Agrees) => observer.suspected = None,
-            Some(WindowOutcome::Mistaken(misreading)) => observer.suspect(misreading, at),
-            Some(WindowOutcome::Open) | None => {}
+        observer.comparison.add(&PlacedReport::of(report), &others);
+        if is_due && observer.comparison.is_complete() {
+            self.judged_at = at;
+            match observer.comparison.take_outcome() {
+                WindowOutcome::Agrees => observer.suspected = None,
+                WindowOutcome::Mistaken(misreading) => observer.suspect(misreading, at),
+                WindowOutcome::Open => {}
+            }
         }
     }
 }
 
-/// Maximum number of other vehicles in a comparison.
-const MAX_OTHERS: usize = 16;
-
-/// Maximum time between the captures of two reports that are compared.
-const SIMULTANEOUS: Duration = Duration::from_millis(200);
+/// The first reports of the first vehicles. A vehicle is one witness, however many parts it has.
+fn witnesses(reports: Vec<&ObjectReport>) -> Vec<PlacedReport> {
+    let mut vehicles: Vec<(NodeName, usize)> = Vec::new();
+    let mut placed = Vec::new();
+    for report in reports {
+        let vehicle = report.node.vehicle();
+        let known = vehicles.iter().position(|(name, _)| *name == vehicle);
+        let number = known.unwrap_or(vehicles.len());
+        if number == vehicles.len() {
+            vehicles.push((vehicle, 0));
+        }
+        let parts = &mut vehicles[number].1;
+        *parts += 1;
+        if number < MAX_OTHERS && *parts <= MAX_PARTS_COMPARED {
+            placed.push(PlacedReport {
+                witness: 1 << number,
+                ..PlacedReport::of(report)
+            });
+        }
+    }
+    placed
+}
 
 impl ComparedObserver {
     /// Counts a window that shows a mistake; another mistake starts anew.
     fn suspect(&mut self, misreading: Misreading, at: Timestamp) {
         let windows = match &self.suspected {
             Some(known)
-                if known.misreading.is_like(&misreading) && at.since(known.shown_at) < LASTS =>
+                if known.misreading.is_like(&misreading)
+                    && at.since(known.shown_at) < MISTAKE_MEMORY =>
             {
                 known.windows.saturating_add(1)
             }

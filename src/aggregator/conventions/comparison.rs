@@ -14,6 +14,9 @@ const WINDOW: usize = 10;
 /// of a window.
 const MIN_OBJECTS: usize = 4;
 
+/// Minimum number of explained objects that another vehicle must have reported to be a witness.
+const MIN_OF_WITNESS: u32 = 2;
+
 /// Maximum number of compared objects of a report, and of other observers' objects.
 const MAX_OBJECTS: usize = 16;
 const MAX_REFERENCES: usize = 64;
@@ -49,6 +52,9 @@ const SHIFT_GATES: [f64; 5] = [2.0, 3.0, 4.0, 5.0, 6.0];
 /// gates.
 const MIN_SPREAD_GATES: f64 = 3.0;
 
+/// Minimum distance, in gates, from the only other vehicle for a change about the own position.
+const MIN_APART_GATES: f64 = 10.0;
+
 /// Change of the heading in radians that ends a window.
 const MAX_HEADING_CHANGE_RAD: f64 = 0.09;
 
@@ -82,6 +88,8 @@ struct ComparedReport {
     gate_m: f64,
     /// Number of objects that nearly coincide as reported.
     agreeing: usize,
+    /// Distance in metres of the only other vehicle; `None` beside several, or without poses.
+    lone_witness_m: Option<f64>,
 }
 
 /// An object of another observer.
@@ -89,16 +97,17 @@ struct ComparedReport {
 struct Reference {
     position: Point2<f64>,
     observer: Option<Pose>,
+    /// A bit for each other vehicle that reported it.
+    witnesses: u32,
 }
 
 impl WindowComparison {
-    /// Adds a report and simultaneous reports of others, the nearest first; returns the outcome of a complete window.
-    pub(super) fn add(
-        &mut self,
-        own: PlacedReport,
-        others: &[PlacedReport],
-    ) -> Option<WindowOutcome> {
-        let snapshot = ComparedReport::of(own, others)?;
+    /// Adds a report and simultaneous reports of other vehicles, the nearest first.
+    /// Reports with too few distinct objects are not compared.
+    pub(super) fn add(&mut self, own: &PlacedReport, others: &[PlacedReport]) {
+        let Some(snapshot) = ComparedReport::of(own, others) else {
+            return;
+        };
         let turned_rad = |first: &ComparedReport| {
             let heading_rad = first.pose?.heading_rad;
             Some(wrap_angle(snapshot.pose?.heading_rad - heading_rad).abs())
@@ -106,12 +115,22 @@ impl WindowComparison {
         if self.snapshots.first().and_then(turned_rad) > Some(MAX_HEADING_CHANGE_RAD) {
             self.snapshots.clear();
         }
+        if self.is_complete() {
+            self.snapshots.remove(0);
+        }
         self.snapshots.push(snapshot);
-        (self.snapshots.len() == WINDOW).then(|| {
-            let outcome = self.outcome();
-            self.snapshots.clear();
-            outcome
-        })
+    }
+
+    /// True if the window can be judged.
+    pub(super) fn is_complete(&self) -> bool {
+        self.snapshots.len() == WINDOW
+    }
+
+    /// Judges the window and begins the next one.
+    pub(super) fn take_outcome(&mut self) -> WindowOutcome {
+        let outcome = self.outcome();
+        self.snapshots.clear();
+        outcome
     }
 
     fn outcome(&self) -> WindowOutcome {
@@ -133,6 +152,7 @@ impl WindowComparison {
                 if explained as f64 >= MIN_EXPLAINED * total as f64
                     && self.unchanged() as f64 <= MAX_UNCHANGED * explained as f64
                     && self.is_spread(&misreading)
+                    && self.is_witnessed(&misreading)
                     && !self.has_rival(&misreading, explained, &angles) =>
             {
                 WindowOutcome::Mistaken(misreading)
@@ -163,6 +183,20 @@ impl WindowComparison {
                 && root_mean_square_m(&explained) >= MIN_SPREAD_GATES * snapshot.gate_m
         });
         2 * spread.count() > self.snapshots.len()
+    }
+
+    /// True if in most reports the explained objects are objects of two other vehicles. One vehicle
+    /// against another shows only that they differ: a change about a point that both share would
+    /// explain the right one, too. Changes about the observer's own position need only one other
+    /// vehicle, if that stands elsewhere.
+    fn is_witnessed(&self, misreading: &Misreading) -> bool {
+        let witnessed = self.snapshots.iter().filter(|snapshot| {
+            let stands_elsewhere = snapshot
+                .lone_witness_m
+                .is_some_and(|distance_m| distance_m >= MIN_APART_GATES * snapshot.gate_m);
+            snapshot.witnesses(misreading) >= 2 || stands_elsewhere && !misreading.is_of_frame()
+        });
+        2 * witnessed.count() > self.snapshots.len()
     }
 
     /// True if a different change, or a shift of the same change, explains many of the objects.
@@ -197,7 +231,7 @@ impl WindowComparison {
 
 impl ComparedReport {
     /// `None` if the report has too few distinct objects.
-    fn of(own: PlacedReport, others: &[PlacedReport]) -> Option<Self> {
+    fn of(own: &PlacedReport, others: &[PlacedReport]) -> Option<Self> {
         let centre = own
             .pose
             .map_or_else(|| mean(&own.objects), |pose| pose.position);
@@ -225,6 +259,15 @@ impl ComparedReport {
                 others.any(|other| is_near(object, &other.objects, PRESENT_GATES * gate_m))
             })
             .count();
+        let nearest = others.first();
+        let lone_witness = nearest.filter(|nearest| {
+            let mut others = others.iter();
+            others.all(|other| other.witness == nearest.witness)
+        });
+        let lone_witness_m = lone_witness.and_then(|other| {
+            let distance_m = nalgebra::distance(&own.pose?.position, &other.pose?.position);
+            Some(distance_m)
+        });
         let references = if agreeing as f64 > CERTAINLY_AGREEING * objects.len() as f64 {
             Vec::new()
         } else {
@@ -236,7 +279,27 @@ impl ComparedReport {
             references,
             gate_m,
             agreeing,
+            lone_witness_m,
         })
+    }
+
+    /// Number of other vehicles of which some objects coincide with the explained ones.
+    fn witnesses(&self, misreading: &Misreading) -> usize {
+        let images: Vec<_> = self.coinciding(misreading, None).collect();
+        let mut objects = [0; u32::BITS as usize];
+        for reference in &self.references {
+            let change = misreading.change_of_other(reference.observer.as_ref());
+            let coincides = change.is_some_and(|change| {
+                is_near(&change.apply(&reference.position), &images, self.gate_m)
+            });
+            for (number, objects) in objects.iter_mut().enumerate() {
+                *objects += u32::from(coincides) & reference.witnesses >> number;
+            }
+        }
+        objects
+            .into_iter()
+            .filter(|objects| *objects >= MIN_OF_WITNESS)
+            .count()
     }
 
     /// Images of the objects that coincide after the change and a shift in gates.
@@ -264,16 +327,21 @@ impl ComparedReport {
     }
 }
 
-/// Distinct objects of other observers.
+/// Distinct objects of other vehicles.
 fn references(others: &[PlacedReport], same_m: f64) -> Vec<Reference> {
     let mut references: Vec<Reference> = Vec::new();
     for other in others {
         for object in &other.objects {
-            let is_same = |known: &Reference| (known.position - object).norm() <= same_m;
-            if references.len() < MAX_REFERENCES && !references.iter().any(is_same) {
+            let is_same = |known: &&mut Reference| {
+                (known.position - object).norm_squared() <= same_m * same_m
+            };
+            if let Some(known) = references.iter_mut().find(is_same) {
+                known.witnesses |= other.witness;
+            } else if references.len() < MAX_REFERENCES {
                 references.push(Reference {
                     position: *object,
                     observer: other.pose,
+                    witnesses: other.witness,
                 });
             }
         }
@@ -372,13 +440,9 @@ impl AngleVotes {
 
     /// All turns and mirrors with more votes than `most`.
     fn above(&self, most: f64) -> impl Iterator<Item = Misreading> {
-        let many = move |votes: &[usize; BINS]| {
-            let votes = votes.to_vec().into_iter().enumerate();
-            let bins = votes.filter(move |(_, votes)| *votes as f64 > most);
-            bins.map(|(bin, _)| bin_angle_rad(bin as f64))
-        };
-        let turns = many(&self.turns).map(|angle_rad| self.turn(angle_rad));
-        turns.chain(many(&self.mirrors).map(|angle_rad| self.mirror(angle_rad)))
+        let turns = angles_above(&self.turns, most).map(|angle_rad| self.turn(angle_rad));
+        let mirrors = angles_above(&self.mirrors, most).map(|angle_rad| self.mirror(angle_rad));
+        turns.chain(mirrors)
     }
 
     fn turn(&self, angle_rad: f64) -> Misreading {
@@ -394,6 +458,13 @@ impl AngleVotes {
             heading_rad: self.heading_rad,
         }
     }
+}
+
+/// The angles of the bins with more votes than `most`.
+fn angles_above(votes: &[usize; BINS], most: f64) -> impl Iterator<Item = f64> {
+    let bins = votes.iter().enumerate();
+    let many = bins.filter(move |(_, votes)| **votes as f64 > most);
+    many.map(|(bin, _)| bin_angle_rad(bin as f64))
 }
 
 /// Distance from an observer in metres, and direction in radians.

@@ -168,6 +168,11 @@ impl Misreading {
         }
     }
 
+    /// True for changes about the origin of the cell, which all observers share.
+    pub(super) fn is_of_frame(&self) -> bool {
+        matches!(self, Self::FrameTurn { .. } | Self::FrameMirror { .. })
+    }
+
     /// True if two windows show the same mistake, of a vehicle whose heading may have changed.
     pub(super) fn is_like(&self, other: &Self) -> bool {
         match (*self, *other) {
@@ -273,23 +278,26 @@ impl fmt::Display for Misreading {
 }
 
 /// Maximum number of objects of a report that are compared.
-const MAX_OBJECTS: usize = 256;
+const MAX_PLACED: usize = 64;
 
 /// The first positions of a report, with the pose of its camera.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct PlacedReport {
     pub(super) pose: Option<Pose>,
     pub(super) objects: Vec<Point2<f64>>,
+    /// The bit of another vehicle in a comparison; 0 for the compared one.
+    pub(super) witness: u32,
 }
 
 impl PlacedReport {
     pub(super) fn of(report: &ObjectReport) -> Self {
-        let objects = report.objects.iter().take(MAX_OBJECTS);
+        let objects = report.objects.iter().take(MAX_PLACED);
         Self {
             pose: report.pose.map(Pose::from),
             objects: objects
                 .map(|object| Point2::new(object.x_m, object.y_m))
                 .collect(),
+            witness: 0,
         }
     }
 }

@@ -284,6 +284,48 @@ fn mistake_of_all_is_named() {
     }
 }
 
+/// A turn about one camera explains the other only if both stand together. A change of the frame
+/// would explain both alike.
+#[test]
+fn two_cameras_name_only_turned_one() {
+    let [euclid, _, watson] = corners();
+    let turned = watson.with(Mistake::HeadingOff(FRAC_PI_2));
+    let found = found_at_crossing(&[euclid, turned], 1);
+    assert_eq!(found.keys().collect::<Vec<_>>(), [&"watson"], "{found:?}");
+    let exchanged = watson.with(Mistake::ExchangedAxes);
+    assert_eq!(found_at_crossing(&[euclid, exchanged], 1), BTreeMap::new());
+}
+
+/// Sixteen parts of a vehicle repeat the objects of a right camera, turned about its position.
+#[test]
+fn parts_are_one_witness() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let bodies = crossing(&mut rng);
+    let mut conventions = Conventions::default();
+    for number in 0..1000 {
+        let at = Timestamp(START.0 + number * 100_000);
+        let places = places(&bodies, number as f64 * 0.1);
+        let reports = corners().map(|camera| camera.report(&places, number, at, &mut rng));
+        for part in 0..16 {
+            let mut repeated = reports[2].clone();
+            repeated.node = NodeName::new(format!("noether--{part}")).unwrap();
+            let centre = repeated.pose.unwrap();
+            for object in &mut repeated.objects {
+                let east_m = object.x_m - centre.x_m;
+                let north_m = object.y_m - centre.y_m;
+                object.x_m = centre.x_m - north_m;
+                object.y_m = centre.y_m + east_m;
+            }
+            conventions.observe(&Arc::new(repeated), at);
+        }
+        for report in reports {
+            let report = Arc::new(report);
+            conventions.observe(&report, at);
+            assert_eq!(conventions.misreading(&report.node, at), None);
+        }
+    }
+}
+
 /// Right observers, also with the errors of their poses that localisation has.
 #[test]
 fn right_observers_are_not_named() {
