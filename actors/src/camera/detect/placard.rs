@@ -149,8 +149,8 @@ impl PlacardDetector {
 }
 
 /// Smallest difference of gray between paper and ink, after the noise of single pixels is averaged,
-/// of a code that is looked for.
-const MIN_CONTRAST: f64 = 32.0;
+/// of a code that is looked for: the decoder takes smaller ones for noise.
+const MIN_CONTRAST: f64 = 24.0;
 
 /// Side in pixels of the square in which contrast is measured: edges of modules up to this size
 /// join to an area.
