@@ -29,37 +29,41 @@ pub(super) struct Template {
 }
 
 impl Guess {
-    /// The key, its guessed value, and the way to measure it.
-    fn advice(self, config: &NodeConfig) -> String {
+    /// The key, its guessed value, and the way to measure it; `None` if the configuration has no
+    /// value.
+    fn advice(self, config: &NodeConfig) -> Option<String> {
         let camera = config.camera.as_ref();
-        let mount = camera.map(|camera| camera.mount).unwrap_or_default();
-        let height_m = mount.height_m.unwrap_or_default();
-        let pitch_deg = mount.pitch_deg;
-        match self {
+        let mount = camera.map(|camera| &camera.mount);
+        let height_m = mount.and_then(|mount| mount.height_m);
+        let pitch_deg = mount.map(|mount| mount.pitch_deg);
+        Some(match self {
             Self::FieldOfView => {
-                let fov_deg = camera.map_or(0.0, |camera| camera.optics.horizontal_fov_deg);
+                let fov_deg = camera?.optics.horizontal_fov_deg;
                 format!(
                     "camera.optics: a horizontal field of view of {fov_deg}° is guessed. Measure it with \
                      `ecod-node calibrate`, or take it from the data sheet."
                 )
             }
             Self::Height => format!(
-                "camera.mount.height_m: {height_m} m above the ground are guessed. Measure with a tape."
+                "camera.mount.height_m: {} m above the ground are guessed. Measure with a tape.",
+                height_m?
             ),
             Self::Tilt => format!(
-                "camera.mount.pitch_deg: {pitch_deg}° below the horizon are guessed. Measure with `ecod-node \
-                 calibrate mount` or on the page."
+                "camera.mount.pitch_deg: {}° below the horizon are guessed. Measure with `ecod-node \
+                 calibrate mount` or on the page.",
+                pitch_deg?
             ),
             Self::MountFromPeople => format!(
-                "camera.mount: {height_m} m and {pitch_deg}° are estimated from people who walk. `ecod-node \
-                 calibrate mount` measures them from known points."
+                "camera.mount: {} m and {}° are estimated from people who walk. `ecod-node \
+                 calibrate mount` measures them from known points.",
+                height_m?, pitch_deg?
             ),
             Self::Position => format!(
                 "pose: {} m east and {} m north of the origin, looking east, is guessed. Measure position and \
                  heading in the frame of the cell.",
                 config.pose.x_m, config.pose.y_m
             ),
-        }
+        })
     }
 }
 
@@ -112,16 +116,16 @@ impl Template {
     }
 
     fn text(&self, config: &NodeConfig, guesses: &[Guess]) -> anyhow::Result<String> {
-        let path = self.path.display();
+        let path = &self.path;
         let mut text = format!(
             "# Written by `ecod-node try`, with the keys that differ from the defaults.\n\
-             # Start the node: ecod-node --config {path}\n"
+             # Start the node: ecod-node --config {path:?}\n"
         );
         if !guesses.is_empty() {
             text += "# The map is as good as these values, so measure and correct them:\n";
         }
-        for guess in guesses {
-            text += &format!("# - {}\n", guess.advice(config));
+        for advice in guesses.iter().filter_map(|guess| guess.advice(config)) {
+            text += &format!("# - {advice}\n");
         }
         let keys = config
             .to_toml_commented()
