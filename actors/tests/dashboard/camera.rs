@@ -354,11 +354,11 @@ async fn wall_shows_all_cameras() {
     let mut other = gauss(directory.path());
     other.pose.y_m = -6.0;
     let (other, other_page) = join(other, &node).await;
-    node.show_cameras(other.cameras().to_vec());
     sees_objects(page).await;
     let browser = Browser::start().await;
     browser.look(1440, 900, "light").await;
     browser.open(&format!("http://{page}/")).await;
+    node.show_cameras(other.cameras().to_vec());
     let wall = "[...document.querySelectorAll('#camera-wall figure')].map((it) => [it.querySelector('figcaption button').textContent, \
         ...[...it.querySelectorAll('.boxes button')].map((box) => box.textContent)].join(' ')).join()";
     let all = "euclid person 87 % cat 87 % dragon 87 %,euclid--rear dog 87 %,gauss horse 87 %";

@@ -55,12 +55,14 @@ export class CameraView {
   /// Lets choose among several cameras.
   #offer(reporters) {
     const isNew = reporters.join() !== this.#reporters.join();
+    // A lone camera is shown alone without a choice.
+    const chosen = this.#reporters.length > 1 && reporters.includes(this.#chosen) ? this.#chosen : null;
     this.#reporters = reporters;
     const chooser = byId("camera-name");
     chooser.hidden = reporters.length < 2;
     keyed(chooser, ["All cameras", ...reporters], (name) => name, () => document.createElement("option"), (option, name) => text(option, name));
-    if (isNew) this.#choose(reporters.length === 1 ? reporters[0] : reporters.includes(this.#chosen) ? this.#chosen : null);
-    // Not under the hand of who chooses.
+    if (isNew) this.#choose(reporters.length === 1 ? reporters[0] : chosen);
+    // The list stays as it is while the user chooses.
     if (document.activeElement !== chooser) chooser.selectedIndex = reporters.indexOf(this.#chosen) + 1;
   }
 
@@ -125,10 +127,10 @@ export class CameraView {
     if (this.#source && (!wanted || this.#source.readyState === EventSource.CLOSED)) this.#close();
     if (!wanted || this.#source) return;
     const source = (this.#source = new EventSource(this.#chosen === null ? "/api/cameras" : `/api/cameras?of=${this.#chosen}`));
-    source.addEventListener("camera", (event) => this.#take(event.lastEventId, JSON.parse(event.data), source));
+    source.addEventListener("camera", (event) => this.#receive(event.lastEventId, JSON.parse(event.data), source));
   }
 
-  async #take(reporter, event, source) {
+  async #receive(reporter, event, source) {
     const bytes = Uint8Array.from(atob(event.jpeg), (letter) => letter.charCodeAt(0));
     const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
     if (source !== this.#source) return;

@@ -124,7 +124,7 @@ export class BirdsEye {
     this.#vehicles(scene.vehicles, scene.now, at, labels);
     this.#cues(scene, at, box, labels);
     this.#details(all, at, box);
-    this.#tellPointer();
+    this.#showPointer();
     labels.place();
     keyed(this.#layers.labels, labels.placed, (label) => label.key, () => svg("text"), (element, label) => {
       set(element, { x: label.x, y: label.y, "text-anchor": label.anchor, class: label.class });
@@ -133,7 +133,7 @@ export class BirdsEye {
   }
 
   #projection(scene, box) {
-    this.#takeIn(scene, box);
+    this.#growBounds(scene, box);
     const [left, bottom, right, top] = this.#bounds;
     const scale = fitting(this.#bounds, box) * this.#zoom;
     const [cx, cy] = [box.width / 2 + this.#shift[0], box.height / 2 + this.#shift[1]];
@@ -144,7 +144,7 @@ export class BirdsEye {
 
   /// Bounds grow at once and shrink late, so that the map stays steady while vehicles come and go, and recovers from a
   /// wrong position. Moved or zoomed by hand, the map keeps its bounds until Fit.
-  #takeIn(scene, box) {
+  #growBounds(scene, box) {
     const moved = this.#zoom !== 1 || this.#shift.some((shift) => shift !== 0);
     if (this.#bounds && moved) return;
     const now = performance.now();
@@ -209,13 +209,13 @@ export class BirdsEye {
     const take = (event) => {
       const { left, top } = this.#picture.getBoundingClientRect();
       this.#pointer = event && [event.clientX - left, event.clientY - top];
-      this.#tellPointer();
+      this.#showPointer();
     };
     for (const kind of ["pointermove", "pointerdown"]) this.#picture.addEventListener(kind, take);
     this.#picture.addEventListener("pointerleave", ({ pointerType }) => pointerType !== "touch" && take(null));
   }
 
-  #tellPointer() {
+  #showPointer() {
     if (!this.#pointer || !this.#at) return text(byId("map-at"), "Point at the map for coordinates");
     const { scale, back } = this.#at;
     const place = back(...this.#pointer);
