@@ -58,7 +58,7 @@ demo-picture: setup ## the recording in README.md: the live page while the edge 
 	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	packaging/page-recording $(PROGRAMS) docs/page.webp
 
-testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
+testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection; the table goes into docs/results.md
 	cargo build --profile $(PROFILE) --locked --bin ecod-lab --example testbed_table
 	for setup in 1 2; do $(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
 	    --at-least 99.5 --occupied-at-least 99 --output target/testbed-setup$$setup.json || exit; done

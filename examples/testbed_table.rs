@@ -51,10 +51,10 @@ fn rows(name: &str, file: &Path) -> anyhow::Result<String> {
     let is_intersection = scenes.iter().any(|scene| !scene["scenes"].is_null());
     Ok(if is_intersection {
         let rows = scenes.iter().map(|scene| {
-            let name = format!("{name}, {}", scene["name"].as_str().unwrap_or_default());
-            row(&name, std::slice::from_ref(scene))
+            let kind = scene["name"].as_str().context("a scene has no name")?;
+            Ok(row(&format!("{name}, {kind}"), std::slice::from_ref(scene)))
         });
-        rows.collect()
+        rows.collect::<anyhow::Result<String>>()?
     } else {
         row(name, scenes)
     })
