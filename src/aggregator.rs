@@ -16,10 +16,10 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
-mod conventions;
 mod expelled;
 mod map_share;
 mod neighbouring;
+mod orientation;
 mod report_doubt;
 #[cfg(test)]
 mod tests;
@@ -30,14 +30,14 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
-pub use conventions::{Misreading, MistakenHeading};
+pub use orientation::{Misreading, MistakenHeading};
 pub use report_doubt::ReportDoubt;
 
-use conventions::Conventions;
 use expelled::Expelled;
 use map_share::limit_shares;
 use nalgebra::Point2;
 use neighbouring::NeighbourView;
+use orientation::OrientationCheck;
 use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
 
 use crate::admission::report_window::{Admitted, ReportWindow};
@@ -106,7 +106,7 @@ pub struct Aggregator {
     /// first.
     overtaken: u64,
     placements: Placements,
-    conventions: Conventions,
+    orientation: OrientationCheck,
     expelled: Expelled,
     neighbours: NeighbourView,
     vote: Option<Vote>,
@@ -150,7 +150,7 @@ impl Aggregator {
             tracks_open_cell,
             overtaken: 0,
             placements: Placements::default(),
-            conventions: Conventions::default(),
+            orientation: OrientationCheck::default(),
             expelled: Expelled::default(),
             neighbours: NeighbourView::default(),
             vote,
@@ -275,7 +275,7 @@ impl Aggregator {
                 }
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
                 if let Admitted::InOrder(_) = admitted {
-                    self.conventions.observe(report, captured_at);
+                    self.orientation.observe(report, captured_at);
                 }
                 let report = &of_vehicle(report);
                 let tracks = self.tracks.as_mut();
@@ -348,7 +348,7 @@ impl Aggregator {
             .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation))
             .or(sender.has_moved.then_some(ReportDoubt::Moves));
         let misread = (kind == ReportKind::Detections)
-            .then(|| self.conventions.misreading(&report.node, now))
+            .then(|| self.orientation.misreading(&report.node, now))
             .flatten();
         place
             .into_iter()

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nalgebra::Point2;
 
-use super::conventions::Misreading;
+use super::orientation::Misreading;
 use crate::model::geometry::Pose;
 use crate::wire::ObjectReport;
 

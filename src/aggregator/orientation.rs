@@ -60,7 +60,7 @@ const OBSERVER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Compares the observers of a cell with each other.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Conventions {
+pub(super) struct OrientationCheck {
     observers: BTreeMap<NodeName, ComparedObserver>,
     judged_at: Timestamp,
 }
@@ -83,7 +83,7 @@ struct SuspectedMistake {
     shown_at: Timestamp,
 }
 
-impl Conventions {
+impl OrientationCheck {
     /// Adds an admitted report, captured at `captured_at` on the aggregator's clock.
     pub(super) fn observe(&mut self, report: &Arc<ObjectReport>, captured_at: Timestamp) {
         if let Some(observer) = self.observers.get_mut(&report.node) {

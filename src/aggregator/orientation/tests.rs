@@ -143,16 +143,16 @@ fn found(
     rng: &mut ChaCha8Rng,
     bodies: impl Fn(f64) -> Vec<Point2<f64>>,
 ) -> BTreeMap<&'static str, String> {
-    let mut conventions = Conventions::default();
+    let mut orientation = OrientationCheck::default();
     let mut found = BTreeMap::new();
     for number in 0..10 * seconds {
         for (order, camera) in cameras.iter().enumerate() {
             let passed_us = number * 100_000 + 17_000 * order as u64;
             let at = Timestamp(START.0 + passed_us);
             let report = camera.report(&bodies(passed_us as f64 * 1e-6), number, at, rng);
-            conventions.observe(&Arc::new(report), at);
+            orientation.observe(&Arc::new(report), at);
             if let Some(misreading) =
-                conventions.misreading(&NodeName::from_static(camera.name), at)
+                orientation.misreading(&NodeName::from_static(camera.name), at)
             {
                 found.insert(camera.name, misreading.to_string());
             }
@@ -301,7 +301,7 @@ fn two_cameras_name_only_turned_one() {
 fn parts_are_one_witness() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let bodies = crossing(&mut rng);
-    let mut conventions = Conventions::default();
+    let mut orientation = OrientationCheck::default();
     for number in 0..1000 {
         let at = Timestamp(START.0 + number * 100_000);
         let places = places(&bodies, number as f64 * 0.1);
@@ -316,12 +316,12 @@ fn parts_are_one_witness() {
                 object.x_m = centre.x_m - north_m;
                 object.y_m = centre.y_m + east_m;
             }
-            conventions.observe(&Arc::new(repeated), at);
+            orientation.observe(&Arc::new(repeated), at);
         }
         for report in reports {
             let report = Arc::new(report);
-            conventions.observe(&report, at);
-            assert_eq!(conventions.misreading(&report.node, at), None);
+            orientation.observe(&report, at);
+            assert_eq!(orientation.misreading(&report.node, at), None);
         }
     }
 }
@@ -452,7 +452,7 @@ fn alike_platoons_are_not_confused() {
                 });
             }
         }
-        let mut conventions = Conventions::default();
+        let mut orientation = OrientationCheck::default();
         for number in 0..3000_u64 {
             let at = Timestamp(START.0 + number * 100_000);
             let places = places(&bodies, number as f64 * 0.1);
@@ -470,8 +470,8 @@ fn alike_platoons_are_not_confused() {
                     .collect();
                 let camera = Camera::new(name, own.x, own.y, heading_rad);
                 let report = camera.report(&others, number, at, &mut rng);
-                conventions.observe(&Arc::new(report), at);
-                let found = conventions.misreading(&NodeName::from_static(name), at);
+                orientation.observe(&Arc::new(report), at);
+                let found = orientation.misreading(&NodeName::from_static(name), at);
                 assert_eq!(found, None, "{name}, {seed}");
             }
         }
@@ -484,7 +484,7 @@ fn alike_platoons_are_not_confused() {
 fn mistake_of_moving_vehicle_is_named() {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let bodies = crossing(&mut rng);
-    let mut conventions = Conventions::default();
+    let mut orientation = OrientationCheck::default();
     let mut found = None;
     for number in 0..1200_u64 {
         let at = Timestamp(START.0 + number * 100_000);
@@ -502,9 +502,9 @@ fn mistake_of_moving_vehicle_is_named() {
         };
         for camera in corners().into_iter().take(2).chain([vehicle]) {
             let report = camera.report(&places, number, at, &mut rng);
-            conventions.observe(&Arc::new(report), at);
+            orientation.observe(&Arc::new(report), at);
         }
-        let misreading = conventions.misreading(&NodeName::from_static("watson"), at);
+        let misreading = orientation.misreading(&NodeName::from_static("watson"), at);
         found = misreading.map(ToString::to_string).or(found);
     }
     let text = found.expect("the mistake is found");
