@@ -112,7 +112,7 @@ def main() -> None:
                 print(f"line {number} skipped: {error}", file=sys.stderr)
         time.sleep(LAST_ANSWER_S)
     if unsent:
-        sys.exit(f"{unsent} of {frames} frames were not sent: no connection to the broker")
+        sys.exit(f"{unsent} of {frames} frames were not sent: the broker is gone or takes them too slowly")
 
 
 if __name__ == "__main__":
