@@ -202,16 +202,19 @@ fn place(text: &str) -> Result<CameraPlace, String> {
         .split(',')
         .map(|part| finite(part.trim()).ok())
         .collect();
-    let (x_m, y_m, heading_deg) = match numbers.as_deref() {
-        Some(&[x_m, y_m]) => (x_m, y_m, None),
-        Some(&[x_m, y_m, heading_deg]) => (x_m, y_m, Some(heading_deg)),
-        _ => return Err("must be three numbers, such as 1.5,-2,90".to_owned()),
-    };
-    Ok(CameraPlace {
-        x_m,
-        y_m,
-        heading_deg,
-    })
+    match numbers.as_deref() {
+        Some(&[x_m, y_m]) => Ok(CameraPlace {
+            x_m,
+            y_m,
+            heading_deg: None,
+        }),
+        Some(&[x_m, y_m, heading_deg]) => Ok(CameraPlace {
+            x_m,
+            y_m,
+            heading_deg: Some(heading_deg),
+        }),
+        _ => Err("must be X,Y,HEADING, such as 1.5,-2,90, or X,Y with --azimuth".to_owned()),
+    }
 }
 
 #[cfg(feature = "dds")]
