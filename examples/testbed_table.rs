@@ -12,8 +12,8 @@ use serde_json::Value;
 const HEADER: &str = "| | scenes | maps, verdicts | VOTE % | PACE % | one answer % | `paper` % | majority % | best alone % |\n\
                       |---|---|---|---|---|---|---|---|---|\n";
 
-/// Fields of a scene that become columns: VOTE, PACE, both together, `paper` mode, majority. The
-/// results of a parking lot have the first name of `paper` mode, those of an intersection the second.
+/// Fields of a scene that become columns: VOTE, PACE, both together, `paper` mode, majority. Parking
+/// lots and intersections name their share in `paper` mode differently.
 const SHARES: [&[&str]; 5] = [
     &["vote_accuracy_pct"],
     &["pace_accuracy_pct"],

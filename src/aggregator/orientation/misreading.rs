@@ -40,7 +40,7 @@ pub enum Misreading {
     Shared(MistakenHeading),
 }
 
-/// What a stated heading seems to be.
+/// A mistake that explains the heading which an observer states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MistakenHeading {
     /// Clockwise from north instead of counter-clockwise from east.
