@@ -11,6 +11,11 @@ use crate::pace::grouping::{Place, VehicleItems};
 use crate::perception::landmark::LandmarkCandidate;
 use crate::wire::PerceivedObject;
 
+/// Maximum number of labels of a belief: the weakest is dropped. Consensus compares the labels of all
+/// vehicles with each other, so a vehicle that states another label in every frame would otherwise
+/// delay the cell's rounds.
+const MAX_LABELS: usize = 8;
+
 /// Places of `bayes` PACE: the object and the vacancy sign of each landmark, in configuration
 /// order.
 impl Place {
@@ -194,7 +199,7 @@ impl VehicleBelief {
 
 impl Belief {
     /// Counts one frame that had the place in view: a hit with an object, a miss without; labels
-    /// whose evidence is used up are dropped.
+    /// whose evidence is used up, and the weakest beyond [`MAX_LABELS`], are dropped.
     fn update(
         &mut self,
         found: Option<&PerceivedObject>,
@@ -206,6 +211,16 @@ impl Belief {
             None => self.miss(increments, config),
         }
         self.labels.retain(|evidence| evidence.nats > 0.0);
+        if self.labels.len() > MAX_LABELS {
+            let weakest = self
+                .labels
+                .iter()
+                .enumerate()
+                .min_by(|(_, a), (_, b)| a.nats.total_cmp(&b.nats));
+            if let Some((weakest, _)) = weakest {
+                self.labels.remove(weakest);
+            }
+        }
     }
 
     /// Counts a detection: evidence for its label, against all other labels, and for the presence
@@ -246,5 +261,26 @@ impl Belief {
             .iter()
             .find(|evidence| evidence.label == *label)
             .map_or(0.0, |evidence| evidence.nats)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Each label has a third of the evidence of the previous one, so none is used up by the later
+    /// ones.
+    #[test]
+    fn ever_new_labels_are_bounded() {
+        let config = PaceConfig::default();
+        let increments = Increments::new(&config);
+        let mut belief = Belief::default();
+        for frame in 0..100 {
+            let label = format!("label-{frame}");
+            let object = PerceivedObject::new(&label, 3_f64.powi(-frame), 0.0, 0.0);
+            belief.update(Some(&object), increments, &config);
+        }
+        assert_eq!(belief.labels.len(), MAX_LABELS);
+        assert_eq!(belief.labels[0].label, "label-0");
     }
 }
