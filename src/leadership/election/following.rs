@@ -189,12 +189,12 @@ impl Election {
     /// Follows the leader that sent `beat`: records epoch, round and clock, drops questions that
     /// wait for the previous leader, and answers by a status.
     fn follow(&mut self, beat: Beat, now: Timestamp) {
+        let beat_interval = self.beat_interval_of(&beat);
         self.epoch = Some(beat.epoch.clone());
         self.observe_round(&beat.epoch.leader, beat.round);
         self.leader_clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now));
         self.waiting_questions.clear();
         let leader = beat.epoch.leader.clone();
-        let beat_interval = Duration::from_millis(beat.every_ms);
         self.state = State::Following(Following::new(
             beat.epoch,
             beat.successors,
@@ -222,10 +222,17 @@ impl Election {
         self.send_status(&leader, now);
     }
 
+    /// The leader's interval of beats to this node, at most this node's own `idle_beat_ms`: a leader
+    /// cannot postpone the time at which its silence ends its leadership.
+    fn beat_interval_of(&self, beat: &Beat) -> Duration {
+        Duration::from_millis(beat.every_ms).min(self.config.idle_beat())
+    }
+
     /// Handles a beat of the followed leader: restarts its deadlines, replaces the list of
     /// successors and the interval of beats, answers questions that waited for a sign of life, and
     /// answers by a status.
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
+        let beat_interval = self.beat_interval_of(&beat);
         self.observe_round(&beat.epoch.leader, beat.round);
         match &mut self.leader_clock {
             Some(clock) if clock.is_of(&beat.epoch) => clock.beat(beat.life, now),
@@ -237,7 +244,7 @@ impl Election {
         let State::Following(following) = &mut self.state else {
             return;
         };
-        following.beat_interval = Duration::from_millis(beat.every_ms);
+        following.beat_interval = beat_interval;
         following.receive(now);
         following.has_beaten = true;
         following.drop_round_interval(now);

@@ -762,6 +762,30 @@ fn repeated_claim_is_not_delayed() {
     assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
 }
 
+/// A leader that states an interval of a minute between its beats, and then stops, is replaced as
+/// soon as a leader with the cell's slowest beats.
+#[test]
+fn long_beat_interval_delays_no_takeover() {
+    let mut election = euclid();
+    let mut now = NOW;
+    let rare = Body::Beat {
+        every_ms: 60_000,
+        round: 1,
+        followers: 255,
+        after: None,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
+    election.handle(of_edge(1, 8, rare), now);
+    assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
+    while !election.is_leading() {
+        now = election.next_deadline();
+        election.tick(now);
+    }
+    let silence = now.since(NOW);
+    assert!(silence < Duration::from_secs(12), "{silence:?}");
+}
+
 /// One certificate is valid for several names: the node's name and the names of its parts.
 #[test]
 fn node_parts_depose_no_leader() {
