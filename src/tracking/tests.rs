@@ -645,6 +645,30 @@ fn vehicle_fills_only_its_share() {
     assert!(tracker.losses().refused > 0);
 }
 
+/// Parts of a vehicle that report the same objects within microseconds are one observation, which
+/// confirms no object: the tracks end early, so that the vehicle's share has room for others.
+#[test]
+fn simultaneous_parts_confirm_nothing() {
+    let config = TracksConfig {
+        max_tracks: 800,
+        ..TracksConfig::default()
+    };
+    let mut tracker = Tracker::new(config, ReputationConfig::default());
+    let row = |y: f64| (0..100).map(|n| car(n as f64 * 10.0, y)).collect();
+    for part in 0..8 {
+        let report = ObjectReport {
+            captured_at_us: Timestamp(at(0).0 + part),
+            ..report("mallory", part, row(0.0))
+        };
+        tracker.observe(report, at(0));
+    }
+    assert_eq!(tracker.close(at(0)).objects.len(), 100);
+    tracker.close(at(35));
+    tracker.observe(report("mallory", 36, row(500.0)), at(36));
+    tracker.close(at(36));
+    assert_eq!(tracker.losses().refused, 0);
+}
+
 prop_compose! {
     fn object()(
         label in prop_oneof![Just("car"), Just("person")],

@@ -39,6 +39,10 @@ const ERROR_RATE: f64 = 1.6;
 /// Number of detections that confirm a track.
 pub(super) const CONFIRMED_HITS: u32 = 5;
 
+/// Minimum time between two detections by one vehicle that both confirm a track: the parts of a vehicle
+/// may report the same object almost at once.
+const CONFIRMING_INTERVAL: Duration = Duration::from_millis(20);
+
 /// Maximum evidence from observations for an object that only one vehicle detects, nats.
 const SOLE_NATS: f64 = 2.0;
 
@@ -160,6 +164,27 @@ impl Track {
     pub(super) fn record_hit(&mut self, at: Timestamp) {
         self.last_seen = self.last_seen.max(at);
         self.hits = self.hits.saturating_add(1);
+    }
+
+    /// Records a detection by `sensors` at `at`, before their histories are updated. The detection
+    /// confirms the track only if the last one by one of the sensors is long enough ago.
+    pub(super) fn record_hit_by(
+        &mut self,
+        mut sensors: impl Iterator<Item = SensorId>,
+        at: Timestamp,
+    ) {
+        let confirms = sensors.any(|sensor| {
+            let last = self
+                .history
+                .get(sensor)
+                .and_then(|history| history.last_hit);
+            last.is_none_or(|last| at.since(last) >= CONFIRMING_INTERVAL)
+        });
+        if confirms {
+            self.record_hit(at);
+        } else {
+            self.last_seen = self.last_seen.max(at);
+        }
     }
 
     /// Similarity of a detection's labels to the track's labels, 0 to 1.

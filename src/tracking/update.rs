@@ -323,7 +323,7 @@ impl InstantUpdate<'_> {
             track.state.class = ObjectClass::of(&track.label(self.config), self.config);
         }
         track.state.limit_speed();
-        track.record_hit(at);
+        track.record_hit_by(hits().map(|(scan, _)| scan.sensor), at);
         if is_known {
             let estimated = track.state.covariance_at(at).trace() / 2.0;
             let here = track.state.position_at(at);
