@@ -75,7 +75,7 @@ pub struct TracksConfig {
     pub align_delay_s: f64,
     /// Time constant in seconds of the errors of a pose. Default 10.
     pub align_memory_s: f64,
-    /// Maximum number of objects; those that only one vehicle has detected take at most a quarter.
+    /// Maximum number of objects; those that only one vehicle has detected take at most an eighth.
     /// Default 20000.
     pub max_tracks: usize,
     /// Maximum number of objects in a square with `gate_m` as side. Default 16: reports cannot claim more in an area.

@@ -32,7 +32,7 @@ pub(super) struct TrackStore {
 }
 
 /// The store has this many shares. The sole tracks of one vehicle use at most one share.
-const SHARES: usize = 4;
+const SHARES: usize = 8;
 
 impl TrackStore {
     pub(super) fn new(config: &TracksConfig) -> Self {
