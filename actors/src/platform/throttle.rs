@@ -114,6 +114,19 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
     }
 }
 
+/// Tokens of the largest report among the reports of a vehicle: decoding it costs as much processor
+/// time as that many small ones, whether or not it is fused.
+pub(crate) const LARGEST_REPORT: u32 = 12;
+
+/// Tokens of the largest message with boxes, which are also projected and encoded as reports.
+pub(crate) const LARGEST_BOXES: u32 = 64;
+
+/// Tokens of a message of `bytes`, if a message of `max_bytes` takes `largest`; at least 1.
+pub(crate) fn tokens_by_size(bytes: usize, max_bytes: usize, largest: u32) -> u32 {
+    let share = bytes.min(max_bytes) as f64 / max_bytes.max(1) as f64;
+    ((share * f64::from(largest)) as u32).max(1)
+}
+
 /// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴
 /// addresses to choose from.
 pub(crate) fn host_network(address: IpAddr) -> IpAddr {

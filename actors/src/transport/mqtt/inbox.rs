@@ -24,7 +24,7 @@ use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use super::security::Security;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
-use crate::platform::throttle::KeyedThrottle;
+use crate::platform::throttle::{KeyedThrottle, LARGEST_REPORT, tokens_by_size};
 use crate::telemetry::counters::{Counters, Event, ShedReason};
 
 /// Decodes, checks and delivers packets; shared by the links of a gateway.
@@ -50,10 +50,6 @@ pub(crate) struct Inbox {
 /// Number of own rounds whose echoes are recognised without decoding: map and verdicts of two
 /// rounds, each of which comes back from up to two brokers.
 const MAX_PUBLISHED: usize = 4;
-
-/// Number of small reports for which a report of the largest size counts: decoding it costs as much
-/// processor time, whether or not it is fused.
-const LARGEST_REPORTS: usize = 12;
 
 type NodeThrottle = Mutex<KeyedThrottle<NodeName>>;
 
@@ -346,9 +342,8 @@ impl Inbox {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        let bytes = payload.len().min(self.limits.payload_bytes);
-        let size = LARGEST_REPORTS * bytes / self.limits.payload_bytes;
-        let count = (size as u32).clamp(1, self.max_report_hz);
+        let count = tokens_by_size(payload.len(), self.limits.payload_bytes, LARGEST_REPORT)
+            .min(self.max_report_hz);
         let is_shed = self.is_shed(
             throttle,
             ShedReason::ReportThrottled,
@@ -694,7 +689,7 @@ mod tests {
                 ..ObjectReport::new(NodeName::from_static(node), ms, Timestamp(ms))
             };
             let payload = encode(&report, Encoding::Json);
-            let share = LARGEST_REPORTS * payload.len() / inbox.limits.payload_bytes;
+            let share = tokens_by_size(payload.len(), inbox.limits.payload_bytes, LARGEST_REPORT);
             assert_eq!(share, 7);
             accept(&inbox, topic, &payload, Timestamp(ms * 1000));
         }

@@ -72,6 +72,36 @@ async fn certified_vehicle_reports_without_node() {
     cell.stop().await;
 }
 
+/// Messages with a thousand boxes count as many small ones, because each takes milliseconds of the
+/// broker's thread; small messages are accepted again right after them.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn many_boxes_count_as_several() {
+    let cell = Cell::of_four().await;
+    let program = Program::connect("yolo", cell.door("euclid"), &[]).await;
+    let name = "euclid--yolo";
+    let topic = "boxes/euclid--yolo";
+    let began = std::time::Instant::now();
+    let mut accepted = 0;
+    for seq in 0..40 {
+        let mut payload = boxes(name, seq);
+        payload["boxes"] = vec![payload["boxes"][0].clone(); 1000].into();
+        let (reason, text) = program.ask(topic, payload.to_string().into_bytes()).await;
+        if reason == "Success" {
+            accepted += 1;
+        } else {
+            assert!(text.contains("counts as up to"), "{reason} {text}");
+        }
+    }
+    let most = 3.0 + 4.0 * began.elapsed().as_secs_f64();
+    assert!(f64::from(accepted) <= most, "{accepted} of {most}");
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    let (reason, text) = program
+        .ask(topic, boxes(name, 40).to_string().into_bytes())
+        .await;
+    assert_eq!(reason, "Success", "{text}");
+    cell.stop().await;
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn unusable_boxes_name_reason() {
     let cell = Cell::of_four().await;

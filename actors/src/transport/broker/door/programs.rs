@@ -38,6 +38,7 @@ use super::{
     Publication, lock,
 };
 use crate::platform::clock;
+use crate::platform::throttle::{LARGEST_BOXES, LARGEST_REPORT, tokens_by_size};
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
 
@@ -170,9 +171,10 @@ impl Door {
         let setup = &door.setup;
         let topic = Topic::Boxes(name.clone());
         let now = clock::now();
+        let tokens = tokens_by_size(payload.len(), setup.limits.payload_bytes, LARGEST_BOXES);
         match route {
-            BoxRoute::Node => door.check_rate(ReportKind::Detections, now)?,
-            BoxRoute::Broker => door.check_nodeless_rate(&name.vehicle(), now)?,
+            BoxRoute::Node => door.check_rate(ReportKind::Detections, tokens, now)?,
+            BoxRoute::Broker => door.check_nodeless_rate(&name.vehicle(), tokens, now)?,
         }
         let boxes = decode_boxes(payload, name, &setup.limits).map_err(|flaw| {
             let text =
@@ -323,7 +325,8 @@ impl DoorState {
         };
         self.check_name(principal, &name)?;
         let now = clock::now();
-        self.check_rate(kind, now)?;
+        let tokens = tokens_by_size(payload.len(), setup.limits.payload_bytes, LARGEST_REPORT);
+        self.check_rate(kind, tokens, now)?;
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
             let detail = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
@@ -356,28 +359,35 @@ impl DoorState {
         )))
     }
 
-    /// Checks the rate of the reports of all programs of the node together.
-    fn check_rate(&self, kind: ReportKind, now: Timestamp) -> Result<(), DoorRefusal> {
+    /// Checks the rate of the reports of all programs of the node together; a large report counts as
+    /// several, its `tokens`.
+    fn check_rate(&self, kind: ReportKind, tokens: u32, now: Timestamp) -> Result<(), DoorRefusal> {
+        let most = (self.setup.max_report_hz / 2).max(1);
         let throttle = self.throttles.get(kind as usize);
-        if throttle.is_none_or(|throttle| lock(throttle).allow(now)) {
+        if throttle.is_none_or(|throttle| lock(throttle).allow_many(tokens.min(most), now)) {
             return Ok(());
         }
         let node = &self.setup.node;
-        let most = self.setup.max_report_hz / 2;
         let text = format!(
-            "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz"
+            "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz; a large report counts as up to {LARGEST_BOXES}"
         );
         Err(DoorRefusal::new(RefusalReason::Throttled, text))
     }
 
-    /// Checks the rate of the boxes of a vehicle without a node.
-    fn check_nodeless_rate(&self, vehicle: &NodeName, now: Timestamp) -> Result<(), DoorRefusal> {
-        if lock(&self.nodeless_boxes).allow(vehicle, now) {
+    /// Checks the rate of the boxes of a vehicle without a node; a large message counts as several,
+    /// its `tokens`.
+    fn check_nodeless_rate(
+        &self,
+        vehicle: &NodeName,
+        tokens: u32,
+        now: Timestamp,
+    ) -> Result<(), DoorRefusal> {
+        let most = self.setup.max_report_hz;
+        if lock(&self.nodeless_boxes).allow_many(vehicle, tokens.min(most), now) {
             return Ok(());
         }
-        let most = self.setup.max_report_hz;
         let text = format!(
-            "{vehicle} reports boxes more than {most} times a second, as mqtt.max_report_hz allows"
+            "{vehicle} reports boxes more than {most} times a second, as mqtt.max_report_hz allows; a large message counts as up to {LARGEST_BOXES}"
         );
         Err(DoorRefusal::new(RefusalReason::Throttled, text))
     }
