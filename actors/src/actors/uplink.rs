@@ -1,10 +1,10 @@
 //! The actor that connects the cell to a region of cells, while its node leads.
 //!
 //! ```text
-//! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
-//! LeaderElection ── SetStatus ─────────────────────> │ ▲
-//! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
-//!                                                    └── TakeNeighbours ──> Fuser
+//! watches of leadership and newest map ── Update ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
+//! LeaderElection ── SetStatus ───────────────────────> │ ▲
+//! Node ── Configure ─────────────────────────────────> │ └── HandleRegionMessage ── RegionInbox ◄── maps of the tiles around ──┘
+//!                                                      └── HandleNeighbours ──> Fuser
 //! ```
 //!
 //! - The cell does not depend on the uplink: without the region the cell continues, and maps are
@@ -142,7 +142,7 @@ impl Actor for Uplink {
                 origin,
                 description,
             } => state.configure(origin, description, &myself),
-            UplinkMessage::Take { delivery } => match delivery.message {
+            UplinkMessage::HandleRegionMessage { delivery } => match delivery.message {
                 FromRegion::Map { topic, map } => {
                     state.on_map(&topic, *map, delivery.received_at);
                 }
@@ -213,8 +213,9 @@ impl UplinkState {
     fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
         let receiver = myself.clone();
         // An uplink that has ended needs no events.
-        let subscriber =
-            Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
+        let subscriber = Box::new(move |delivery| {
+            _ = receiver.cast(UplinkMessage::HandleRegionMessage { delivery });
+        });
         let limits = self.connection.limits();
         let counters = Arc::clone(&self.setup.counters);
         let sink = RegionInbox::new(
@@ -428,7 +429,7 @@ impl UplinkState {
         neighbours.observe_own(map, now);
         if std::mem::take(&mut self.has_news) {
             let objects = neighbours.near(now).into();
-            self.setup.fuser.send(FuserMessage::TakeNeighbours {
+            self.setup.fuser.send(FuserMessage::HandleNeighbours {
                 objects,
                 stated_at: now,
             });

@@ -22,7 +22,7 @@ fn spans() -> Spans {
 
 fn map(epoch: &Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = Arc::new(GlobalMap::new(epoch, round, Timestamp(0)));
-    FollowerMessage::TakeMap {
+    FollowerMessage::HandleMap {
         delivery: Delivery::local(map, received_at),
     }
 }
@@ -92,7 +92,7 @@ async fn forged_map_replaces_no_leader() {
 
         let mut fuser = standby();
         let mut maps = 0;
-        while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
+        while let Ok(FuserMessage::HandleMap { map, received_at }) = told.try_recv() {
             fuser.on_map(map, received_at);
             maps += 1;
         }
@@ -108,7 +108,7 @@ async fn forged_map_replaces_no_leader() {
 #[tokio::test]
 async fn expelled_leaders_map_is_dropped() {
     let mut fuser = standby();
-    let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
+    let FollowerMessage::HandleMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
         panic!("a map")
     };
     fuser.on_map(Arc::clone(&delivery.message), Timestamp(1));
