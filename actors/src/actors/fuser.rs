@@ -143,7 +143,7 @@ impl Actor for Fuser {
                 state.command(Command::Configure { fusion, landmarks });
             }
             FuserMessage::HandleNeighbours { objects, stated_at } => {
-                state.command(Command::TakeNeighbours { objects, stated_at });
+                state.command(Command::OnNeighbours { objects, stated_at });
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
