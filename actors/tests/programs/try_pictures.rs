@@ -53,9 +53,9 @@ fn album(directory: &Path, photograph: &str) -> String {
 }
 
 /// A running program, killed when dropped.
-struct Trial(Child);
+struct TryProgram(Child);
 
-impl Drop for Trial {
+impl Drop for TryProgram {
     fn drop(&mut self) {
         self.0.kill().ok();
         self.0.wait().unwrap();
@@ -141,8 +141,8 @@ fn two_cameras_make_one_map() {
         .args(["--dashboard", "127.0.0.1:0"])
         .arg("--save")
         .arg(&saved);
-    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
+    let mut program = TryProgram(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(program.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
     let page = address(&mut lines, "page");
@@ -188,8 +188,8 @@ fn two_cameras_make_one_map() {
         "before the other camera, 50 m away: {found:?}"
     );
 
-    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
-    assert!(trial.0.wait().unwrap().success());
+    kill(Pid::from_raw(program.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(program.0.wait().unwrap().success());
 
     for (name, images) in [("node.toml", &albums[0]), ("node-2.toml", &albums[1])] {
         let path = directory.path().join(name);
@@ -229,8 +229,8 @@ fn missing_source_shows_simulated_street() {
     command
         .args(["try", "--dashboard", "127.0.0.1:0"])
         .current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
-    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
+    let mut program = TryProgram(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(program.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
     let page = address(&mut lines, "page");
@@ -267,8 +267,8 @@ fn missing_source_shows_simulated_street() {
     };
     let objects = map(&page).unwrap();
     assert!(!objects.iter().any(near_mast), "{objects:?}");
-    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
-    assert!(trial.0.wait().unwrap().success());
+    kill(Pid::from_raw(program.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(program.0.wait().unwrap().success());
 }
 
 #[test]
