@@ -197,9 +197,9 @@ fn synonyms_apply_without_landmarks() {
 #[test]
 fn unmatched_landmarks_are_listed() {
     let truth = || Truth::parse(r#"{"landmarks": {"a": "cup"}}"#).unwrap();
-    for (id, meets) in [("a", true), ("A", false)] {
+    for (id, matches) in [("a", true), ("A", false)] {
         let mut evaluation = Evaluation::new(truth());
         evaluation.fused(&verdicts(1, &[(id, Some("cup"))]));
-        assert_eq!(evaluation.meets_truth(), meets, "{id}");
+        assert_eq!(evaluation.matches_truth(), matches, "{id}");
     }
 }

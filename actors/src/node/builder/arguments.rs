@@ -87,7 +87,7 @@ impl NodeBuilder {
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
-            looks_on: self.config.looks_on(),
+            only_observes: self.config.only_observes(),
         }
     }
 

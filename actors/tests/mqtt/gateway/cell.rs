@@ -91,7 +91,7 @@ impl Node {
             counters: Arc::clone(&counters),
             subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
             seed: 7,
-            looks_on: false,
+            only_observes: false,
         };
         let (gateway, handle) = Actor::spawn(None, Gateway, arguments).await.unwrap();
         Self {

@@ -61,7 +61,7 @@ impl Voters {
                 }
             }),
             seed: 1,
-            looks_on: false,
+            only_observes: false,
         };
         let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers {
