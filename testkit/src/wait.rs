@@ -14,7 +14,10 @@ pub const PATIENCE: Duration = Duration::from_secs(30);
 pub async fn until(what: &str, mut holds: impl FnMut() -> bool) -> Duration {
     let started = Instant::now();
     while !holds() {
-        assert!(started.elapsed() < PATIENCE, "never: {what}");
+        assert!(
+            started.elapsed() < PATIENCE,
+            "not within the time limit: {what}"
+        );
         sleep(Duration::from_millis(10)).await;
     }
     started.elapsed()
@@ -27,7 +30,10 @@ pub async fn until(what: &str, mut holds: impl FnMut() -> bool) -> Duration {
 pub async fn until_by(what: &str, mut act: impl FnMut(), mut holds: impl FnMut() -> bool) {
     let started = Instant::now();
     while !holds() {
-        assert!(started.elapsed() < PATIENCE, "never: {what}");
+        assert!(
+            started.elapsed() < PATIENCE,
+            "not within the time limit: {what}"
+        );
         act();
         sleep(Duration::from_millis(20)).await;
     }

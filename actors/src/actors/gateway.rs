@@ -375,14 +375,14 @@ impl GatewayState {
             .values()
             .filter(|link| !self.takes_reports_of(&link.broker))
         {
-            let told = link.client.as_ref().map(|client| {
+            let queued = link.client.as_ref().map(|client| {
                 if wanted {
                     client.subscribe(&reports, MaxQos::AtLeastOnce)
                 } else {
                     client.unsubscribe(&reports)
                 }
             });
-            tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");
+            tracing::debug!(broker = %link.broker, wanted, ?queued, "subscription to reports changed");
         }
     }
 

@@ -162,7 +162,10 @@ async fn all_follow(nodes: &[&NodeHandle]) {
     for node in nodes {
         let mut members = node.members();
         let all = members.wait_for(|members| members.len() + 1 >= nodes.len());
-        timeout(PATIENCE, all).await.expect("all meet").unwrap();
+        timeout(PATIENCE, all)
+            .await
+            .expect("all nodes are members")
+            .unwrap();
     }
 }
 
@@ -218,10 +221,10 @@ async fn configuration_spreads_within_two_rounds() {
             .starts_with("# cell lot-1: no description\n")
     );
     let nothing = cell("diff", Some(String::new()), &gauss).await;
-    let told = String::from_utf8(nothing.stderr).unwrap();
+    let error_text = String::from_utf8(nothing.stderr).unwrap();
     assert!(
-        nothing.status.code() == Some(1) && told.contains("the cell has no description yet"),
-        "{told}"
+        nothing.status.code() == Some(1) && error_text.contains("the cell has no description yet"),
+        "{error_text}"
     );
 
     let tracked = "[fusion.tracks]\nmode = \"on\"\n";
@@ -424,7 +427,7 @@ async fn merged_cell_uses_later_description() {
         for node in [&edge, &euclid] {
             map_where(node, "alone", |_| true).await;
         }
-        let stamp = |told: &str| told.split_once(", known").unwrap().0.to_owned();
+        let stamp = |error_text: &str| error_text.split_once(", known").unwrap().0.to_owned();
         let mut stamps = [
             stamp(&set(described(&["a"], ""), &edge).await),
             String::new(),
@@ -511,32 +514,33 @@ async fn contradicting_file_is_reported() {
     .await
     .unwrap();
     let refused = cell("set", Some("[fusion.pace]\ngate_m = 0.9".into()), &euclid).await;
-    let told = String::from_utf8(refused.stderr).unwrap();
+    let error_text = String::from_utf8(refused.stderr).unwrap();
     assert!(
         !refused.status.success()
             && ["`fusion.pace.gate_m`", "0.7", "0.9"]
                 .iter()
-                .all(|p| told.contains(p)),
-        "{told}"
+                .all(|p| error_text.contains(p)),
+        "{error_text}"
     );
     let vehicle = start("vehicle", Role::Cav, &[&edge]).await;
     let refused = cell("set", Some(described(&["x"], "")), &vehicle).await;
-    let told = String::from_utf8(refused.stderr).unwrap();
+    let error_text = String::from_utf8(refused.stderr).unwrap();
     assert!(
-        told.contains("never leads") && told.lines().count() == 1,
-        "{told}"
+        error_text.contains("never leads") && error_text.lines().count() == 1,
+        "{error_text}"
     );
     let unusable = cell("set", Some("[fusion.pace]\ngate_m = -1".into()), &edge).await;
-    let told = String::from_utf8(unusable.stderr).unwrap();
+    let error_text = String::from_utf8(unusable.stderr).unwrap();
     assert!(
-        unusable.status.code() == Some(2) && told.matches("`fusion.pace.gate_m`").count() == 1,
-        "{told}"
+        unusable.status.code() == Some(2)
+            && error_text.matches("`fusion.pace.gate_m`").count() == 1,
+        "{error_text}"
     );
     let huge = cell("set", Some("#".repeat(256 * 1024 + 1)), &edge).await;
-    let told = String::from_utf8(huge.stderr).unwrap();
+    let error_text = String::from_utf8(huge.stderr).unwrap();
     assert!(
-        huge.status.code() == Some(2) && told.contains("at most 262144 bytes"),
-        "{told}"
+        huge.status.code() == Some(2) && error_text.contains("at most 262144 bytes"),
+        "{error_text}"
     );
     for node in [vehicle, euclid, edge] {
         node.stop().await;

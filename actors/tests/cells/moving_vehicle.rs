@@ -302,7 +302,7 @@ async fn earth_poses_use_cell_origin() {
         standing.counters().events(Event::FrameWithoutPose) > 3
     })
     .await;
-    let told = [
+    let parts = [
         "503",
         "`pose.latitude_deg`",
         "no origin",
@@ -310,7 +310,7 @@ async fn earth_poses_use_cell_origin() {
     ];
     until("the trouble is reported", async || {
         let answer = readiness(&standing).await;
-        told.iter().all(|part| answer.contains(part))
+        parts.iter().all(|part| answer.contains(part))
     })
     .await;
 

@@ -46,7 +46,7 @@ async fn browser_follows_new_leader() {
     browser.open(&format!("http://{}/", at_euclid.page)).await;
     browser.until(IS_READY).await;
     println!(
-        "page live {:?} after it was asked for, WebDriver included",
+        "page live {:?} after the request, WebDriver included",
         opened.elapsed()
     );
     browser

@@ -65,7 +65,10 @@ pub(crate) async fn join(mut config: NodeConfig, other: &NodeHandle) -> (NodeHan
 pub(crate) async fn until<F: Future<Output = bool>>(what: &str, holds: impl Fn() -> F) {
     let deadline = tokio::time::Instant::now() + PATIENCE;
     while !holds().await {
-        assert!(tokio::time::Instant::now() < deadline, "never: {what}");
+        assert!(
+            tokio::time::Instant::now() < deadline,
+            "not within the time limit: {what}"
+        );
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
 }

@@ -40,7 +40,7 @@ async fn cost_with_32_vehicles() {
     .await;
     let first = Instant::now();
     Events::open(place.page).await.next().await;
-    println!("first picture {:?} after it was asked for", first.elapsed());
+    println!("first picture {:?} after the request", first.elapsed());
     tokio::time::sleep(Duration::from_secs(3)).await;
     for looked_at in [false, true] {
         let mut events = if looked_at {

@@ -198,7 +198,7 @@ async fn pages_leave_room_for_scrapers() {
     assert_eq!(
         get(page, "/api/events").await.status,
         503,
-        "a page too many asks for pictures"
+        "one page too many requests pictures"
     );
     let refused = node.counters().events(Event::BrowserRefused);
     for path in ["/metrics", "/healthz", "/api/picture"] {

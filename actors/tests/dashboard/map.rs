@@ -478,12 +478,13 @@ async fn terms_are_explained() {
         .until("document.querySelector('#leader').textContent === 'euclid'")
         .await;
     let terms = "[...document.querySelectorAll('[data-term]')]";
-    let told = format!(
+    let sentences_shown = format!(
         "{terms}.map((it) => document.getElementById(it.getAttribute('aria-describedby')).textContent)"
     );
-    let told: Vec<String> = serde_json::from_value(browser.evaluate(&told).await).unwrap();
-    assert!(told.len() >= 13, "{told:?}");
-    for sentences in &told {
+    let sentences_shown: Vec<String> =
+        serde_json::from_value(browser.evaluate(&sentences_shown).await).unwrap();
+    assert!(sentences_shown.len() >= 13, "{sentences_shown:?}");
+    for sentences in &sentences_shown {
         let longest = sentences
             .split(". ")
             .map(|sentence| sentence.split_whitespace().count())
@@ -493,7 +494,7 @@ async fn terms_are_explained() {
     }
     let tip =
         "(document.querySelector('#tip').hidden ? '' : document.querySelector('#tip').textContent)";
-    for (index, words) in told.iter().enumerate() {
+    for (index, words) in sentences_shown.iter().enumerate() {
         if browser
             .evaluate(&format!("{terms}[{index}].checkVisibility()"))
             .await

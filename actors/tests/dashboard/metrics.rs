@@ -81,7 +81,7 @@ async fn metrics_describe_node_activity() {
                 .any(|series| series.split('{').next() == Some(name));
             // Their series exist while nodes are missing or there is a trouble, as other tests show.
             let known = known || ["ecod_member_missing_seconds", "ecod_troubles"].contains(&name);
-            assert!(known, "{name} is asked for and does not exist");
+            assert!(known, "{name} is queried and does not exist");
         }
     }
     drop(vehicles);

@@ -93,8 +93,8 @@ async fn crashed_node_stays_missing() {
     }
     for page in pages {
         until("it is a trouble", || async {
-            let told = troubles(page).await;
-            matches!(&told[..], [[about, cause]] if about == "gauss"
+            let listed = troubles(page).await;
+            matches!(&listed[..], [[about, cause]] if about == "gauss"
                 && cause.starts_with("gone for 1") && cause.contains(", last seen 2"))
         })
         .await;
@@ -110,7 +110,7 @@ async fn crashed_node_stays_missing() {
             missing(page).await.is_empty()
         })
         .await;
-        until("no trouble is left", || async {
+        until("the trouble has ended", || async {
             troubles(page).await.is_empty()
         })
         .await;

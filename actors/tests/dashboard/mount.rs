@@ -186,7 +186,7 @@ async fn points_give_named_camera_mount() {
     assert_eq!(
         post(page, "", "text/plain", &whole).await.status,
         415,
-        "as a foreign page might"
+        "as a page of another origin might"
     );
     assert_eq!(post(page, "", "application/json", "{").await.status, 400);
     let padded = whole + &" ".repeat(16 * 1024);

@@ -114,19 +114,19 @@ fn points_update_mount_in_file() {
         &["points", "--in-map", "--write", "points.csv"],
     );
     is_near(printed(&output), [0.05, 0.05, 0.2, 0.05, 0.2, 0.2]);
-    let told = stderr(&output);
-    let outliers: Vec<_> = told
+    let output_text = stderr(&output);
+    let outliers: Vec<_> = output_text
         .lines()
         .filter(|line| line.contains("OUTLIER"))
         .collect();
     assert_eq!(
-        (outliers.len(), told.matches(" px, ").count()),
+        (outliers.len(), output_text.matches(" px, ").count()),
         (1, 6),
-        "{told}"
+        "{output_text}"
     );
     assert!(
-        told.contains("the middle of the image shows the ground from "),
-        "{told}"
+        output_text.contains("the middle of the image shows the ground from "),
+        "{output_text}"
     );
     let written = std::fs::read_to_string(directory.path().join("node.toml")).unwrap();
     assert!(

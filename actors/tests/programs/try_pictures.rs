@@ -160,14 +160,15 @@ fn two_cameras_make_one_map() {
         std::thread::sleep(Duration::from_millis(200));
         found = objects(&page).unwrap_or(found);
     }
-    let told = |line: &String| line.contains("frames/s") && line.contains("objects on the map");
+    let shows_progress =
+        |line: &String| line.contains("frames/s") && line.contains("objects on the map");
     let next_line = || {
         progress
             .recv_timeout(deadline.saturating_duration_since(Instant::now()))
             .ok()
     };
     assert!(
-        std::iter::from_fn(next_line).any(|line| told(&line)),
+        std::iter::from_fn(next_line).any(|line| shows_progress(&line)),
         "progress is printed"
     );
     for page in [&page, &second] {

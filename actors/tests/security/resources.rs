@@ -265,7 +265,7 @@ async fn absent_readers_have_no_queue() {
         assert_eq!(
             subscribe(&mut gauss, "ecod/v1/lot/detections/v01", 1).await,
             0,
-            "another quality than asked for"
+            "another quality than requested"
         );
         gauss.shutdown().await.unwrap();
         drop(gauss);

@@ -87,7 +87,7 @@ fn figures_match_hand_calculation() {
     assert_eq!(
         vote.mean_recall_pct,
         Some(50.0),
-        "of nothing, cup and mouse"
+        "of no label, cup and mouse"
     );
     assert_eq!(
         vote.majority_accuracy_pct,
@@ -190,7 +190,7 @@ fn synonyms_apply_without_landmarks() {
     assert_eq!(
         pace.unwrap().majority_accuracy_pct,
         Some(0.0),
-        "PACE knows no synonyms"
+        "PACE has no synonyms"
     );
 }
 

@@ -85,7 +85,7 @@ async fn page_counts_cells_in_view() {
     let mut round = 0;
     let shown = loop {
         round += 1;
-        assert!(round < 300, "the map is never shown");
+        assert!(round < 300, "the map is not shown");
         publish(&lot, &far, round);
         tokio::time::sleep(Duration::from_millis(100)).await;
         let shown = look(near).await.unwrap();

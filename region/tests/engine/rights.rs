@@ -53,7 +53,7 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         lot.topic(RegionTopicKind::Map),
         far.topic(RegionTopicKind::Map),
     ];
-    until("both cells are heard", || {
+    until("messages of both cells arrive", || {
         both.iter()
             .all(|topic| arrived.lock().unwrap().contains(topic))
     })
@@ -70,14 +70,14 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     for (topic, retain) in statuses.iter().zip([true, false]) {
         Cell::vanish(broker, LOT.0, topic, retain).await;
     }
-    until("the own last will is heard", || {
+    until("the own last will arrives", || {
         arrived.lock().unwrap().contains(&statuses[1])
     })
     .await;
     // A client that subscribes later would receive a retained forgery.
     let later = listen(broker).await;
     lot.publish_map(2, 1);
-    until("the second reader hears", || {
+    until("the second reader receives maps", || {
         !later.lock().unwrap().is_empty()
     })
     .await;
@@ -103,7 +103,7 @@ async fn nats_rights_end_at_tile() {
     let heard = attack(&broker, &arrived).await;
     let lot = Cell::connect(&broker, LOT);
     let far = Cell::connect(&broker, FAR);
-    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
+    assert_eq!(heard, honest(&lot, &far), "no forged message");
 
     let tiles = lot.account.tile.with_neighbours();
     let around: Vec<_> = tiles
@@ -135,12 +135,12 @@ async fn mosquitto_rights_end_at_tile() {
     let lot = Cell::connect(&broker, LOT);
     let far = Cell::connect(&broker, FAR);
     let own = lot.topic(RegionTopicKind::Map);
-    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
+    assert_eq!(heard, honest(&lot, &far), "no forged message");
     // Subscriptions are granted, and nothing foreign comes.
     lot.subscribe(&["ecod/v1/#".to_owned()]).await;
     far.publish_map(2, 1);
     lot.publish_map(3, 1);
-    until("the own map is heard", || !lot.received().topics.is_empty()).await;
+    until("the own map arrives", || !lot.received().topics.is_empty()).await;
     assert_eq!(lot.received().topics, [own]);
 }
 

@@ -45,7 +45,7 @@ async fn shown(cell: &Cell, program: &Program, name: &str, viewer: &str, contrib
     };
     tokio::time::timeout(PATIENCE, shown)
         .await
-        .unwrap_or_else(|_| panic!("the boxes of {name} are never on the map"));
+        .unwrap_or_else(|_| panic!("the boxes of {name} are not on the map"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -151,8 +151,8 @@ fn handshake_opens_session_once() {
         .seal(&b.id.name, FrameKind::Payload, b"hi", NOW)
         .unwrap();
     assert_eq!(to, b.address);
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
     assert_eq!(
         a.open(&frame, b.address, NOW),
@@ -196,8 +196,8 @@ fn huge_counter_blocks_no_frames() {
     }
     assert_eq!(b.sessions.counters.get(FrameEvent::CounterJump), 4);
     let frame = a.seal(&b.id.name, b"hi");
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
 }
 
 #[test]
@@ -216,8 +216,8 @@ fn live_session_resists_takeover() {
     };
     assert_eq!(take_over(&mut b, NOW), Err(FrameEvent::Replayed));
     let frame = a.seal(&b.id.name, b"hi");
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
     let mut mover = End::new("a", 1);
     mover.address = SocketAddr::from(([10, 0, 0, 8], 1));
     mover.id.gossip = mover.address;
@@ -370,7 +370,7 @@ proptest! {
 /// is a typing error away.
 #[test]
 fn other_key_and_typo_reported() {
-    let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
+    let notices_of = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
         let mut node = End::of_cell((own, "07"), "euclid", 1, None);
         node.known = (!is_alone).then_some(KnownMember {
             run: 1,
@@ -388,7 +388,7 @@ fn other_key_and_typo_reported() {
             .collect::<Vec<_>>()
     };
     assert_eq!(
-        heard("lot-1", ("lot-1", "08"), false),
+        notices_of("lot-1", ("lot-1", "08"), false),
         [(
             TroubleKind::WrongKey,
             "received a datagram of cell lot-1 with another key or none from 10.0.0.7".into()
@@ -398,12 +398,16 @@ fn other_key_and_typo_reported() {
         TroubleKind::OtherCell,
         "received a datagram of cell ux-lott from 10.0.0.7; this node is in ux-lot".into(),
     )];
-    assert_eq!(heard("ux-lot", ("ux-lott", "07"), false), misspelt);
-    assert_eq!(heard("lot-1", ("lot-2", "07"), false), [], "a neighbour");
+    assert_eq!(notices_of("ux-lot", ("ux-lott", "07"), false), misspelt);
     assert_eq!(
-        heard("lot-1", ("lot-2", "07"), true).len(),
+        notices_of("lot-1", ("lot-2", "07"), false),
+        [],
+        "a neighbour"
+    );
+    assert_eq!(
+        notices_of("lot-1", ("lot-2", "07"), true).len(),
         1,
         "who is alone may have meant the other"
     );
-    assert_eq!(heard("ux-lot", ("crossing", "07"), true), []);
+    assert_eq!(notices_of("ux-lot", ("crossing", "07"), true), []);
 }
