@@ -16,14 +16,12 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
-use ecod_testkit::{car_ahead, node_config};
+use ecod_testkit::{PATIENCE, car_ahead, node_config, until_async as until};
 use rumqttc::{AsyncClient, Event as Packets, EventLoop, MqttOptions, Packet, QoS};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
-
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// How far ahead the car of [`car_ahead`] stands.
 const AHEAD_M: f64 = 6.6;
@@ -214,17 +212,6 @@ async fn readiness(node: &NodeHandle) -> String {
     let mut answer = String::new();
     stream.read_to_string(&mut answer).await.unwrap();
     answer
-}
-
-async fn until(what: &str, condition: impl AsyncFn() -> bool) {
-    let met = async {
-        while !condition().await {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    };
-    timeout(PATIENCE, met)
-        .await
-        .unwrap_or_else(|_| panic!("not true in time: {what}"));
 }
 
 /// Reads reports until one is from here.

@@ -4,8 +4,9 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
+use ecod_testkit::until_async as until;
 
-use crate::cell::{Vehicles, until};
+use crate::cell::Vehicles;
 use crate::http::{Events, get, try_request};
 use crate::processes::{free_places, start};
 

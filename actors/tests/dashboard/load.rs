@@ -8,11 +8,12 @@ use ecod_actors::node::NodeHandle;
 use ecod_actors::observe::dashboard::DashboardConfig;
 use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 
-use crate::cell::{Vehicles, config, start, until};
+use crate::cell::{Vehicles, config, start};
 use crate::http::{Events, get, get_with};
 
 /// Longest time between two maps of the node while something goes on.

@@ -11,10 +11,11 @@ use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::dashboard::{FloorPlanConfig, FloorPlanPoint};
 use ecod_actors::platform::clock;
+use ecod_testkit::until_async as until;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
 
-use crate::cell::{config, start, until};
+use crate::cell::{config, start};
 use crate::http::get;
 use crate::webdriver::Browser;
 

@@ -5,9 +5,10 @@ use std::net::SocketAddr;
 
 use ecod::wire::Role;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 use serde_json::Value;
 
-use crate::cell::{Vehicles, config, start, until};
+use crate::cell::{Vehicles, config, start};
 use crate::http::get;
 
 /// Samples by name and labels; every line is checked.

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
-use ecod_testkit::{Cell, command};
+use ecod_testkit::{Cell, command, until_async as until};
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep};
 
-use crate::cell::{config, until};
+use crate::cell::config;
 use crate::http::get;
 
 /// A node with a page.

@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeStatus, Role, encode};
+use ecod_testkit::until_async as until;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use serde_json::Value;
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
-use crate::cell::{Vehicles, config, join, start, until};
+use crate::cell::{Vehicles, config, join, start};
 use crate::http::{Events, get, try_request};
 use crate::processes::{self, Place, free_places};
 

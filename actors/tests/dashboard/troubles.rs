@@ -15,14 +15,14 @@ use ecod_actors::node::NodeHandle;
 #[cfg(feature = "camera")]
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::clock;
-use ecod_testkit::PATIENCE;
+use ecod_testkit::{PATIENCE, until_async as until};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
-use crate::cell::{config, join, start, until};
+use crate::cell::{config, join, start};
 use crate::http::get;
 
 /// A client that sends reports one after the other, each made from its number; it ends when dropped. Its id has the
@@ -164,7 +164,7 @@ async fn compass_heading_names_angle() {
         }))
     });
     // Three windows of ten seconds, and as long again.
-    let deadline = Instant::now() + 2 * PATIENCE;
+    let deadline = Instant::now() + PATIENCE;
     let of_kind = || async {
         let mut reported = reported(page).await;
         reported.retain(|[_, _, kind, _]| kind == "orientation");

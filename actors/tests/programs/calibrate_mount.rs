@@ -8,7 +8,7 @@ use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::view::PosedCamera;
 use ecod_actors::camera::image_codec::encode_jpeg;
-use ecod_testkit::walking_people;
+use ecod_testkit::{stderr, walking_people};
 use opencv::core::{CV_8UC1, Mat, Scalar};
 
 const NODE: &str = "# A camera on a mast.\nname = \"mast\"\n[pose]\nx_m = 10\ny_m = -5\nheading_deg = 90\n\
@@ -51,10 +51,6 @@ fn calibrate(directory: &Path, arguments: &[&str]) -> Output {
         "node.toml",
     ]);
     command.args(&arguments[1..]).output().unwrap()
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// The values of `camera.mount` that were printed.

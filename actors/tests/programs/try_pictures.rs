@@ -4,24 +4,19 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use ecod_actors::camera::image_codec;
-use ecod_testkit::command;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use opencv::core::{BORDER_CONSTANT, Mat, Scalar, copy_make_border};
 use serde_json::Value;
 
+use crate::ecod_node;
+
 /// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(120);
-
-fn ecod_node() -> Command {
-    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
-    command.env_remove("RUST_LOG");
-    command
-}
 
 /// A directory with this photograph as its only image, in a frame, so that its objects are not cut.
 fn album(directory: &Path, photograph: &str) -> String {

@@ -1,22 +1,17 @@
 //! `ecod-lab demo` and `ecod-lab testbed` as programs.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod_testkit::{stderr, until_blocking as until};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 fn ecod_lab() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-lab"));
     command.stdin(Stdio::null());
     command
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn scenes() -> PathBuf {
@@ -115,14 +110,6 @@ fn working_in(directory: &Path) -> Vec<i32> {
     });
     ours.filter_map(|process| process.file_name().to_str()?.parse().ok())
         .collect()
-}
-
-fn until(what: &str, reached: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !reached() {
-        assert!(started.elapsed() < PATIENCE, "never reached: {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
 }
 
 #[test]

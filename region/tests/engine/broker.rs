@@ -6,12 +6,11 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use ecod::leadership::BrokerAddress;
 use ecod_region::broker::{BrokerArguments, BrokerLogin};
 use ecod_region::reader::{self, Reading, RegionState};
-use ecod_testkit::output_of;
+use ecod_testkit::{output_of, until_blocking};
 use tempfile::TempDir;
 
 /// A broker and its directory; ended when dropped.
@@ -158,7 +157,7 @@ impl Broker {
             address,
             route: None,
         };
-        wait_for("the broker listens", || TcpStream::connect(address).is_ok());
+        until_blocking("the broker listens", || TcpStream::connect(address).is_ok());
         broker
     }
 
@@ -307,22 +306,4 @@ pub(crate) fn free_address() -> SocketAddr {
         .unwrap()
         .local_addr()
         .unwrap()
-}
-
-/// Waits until something is so.
-pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
-    let patience = Instant::now() + Duration::from_secs(30);
-    while !is_so() {
-        assert!(Instant::now() < patience, "waited in vain until {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-/// Waits until something is so, while others go on.
-pub(crate) async fn until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let patience = Instant::now() + Duration::from_secs(30);
-    while !is_so() {
-        assert!(Instant::now() < patience, "waited in vain until {what}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
 }

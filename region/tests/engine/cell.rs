@@ -13,6 +13,7 @@ use ecod::wire::{
 };
 use ecod_actors::platform::clock;
 use ecod_region::account::CellAccount;
+use ecod_testkit::until;
 use rumqttc::{AsyncClient, Event, LastWill, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
@@ -189,7 +190,7 @@ impl Cell {
             .iter()
             .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce));
         self.client.subscribe_many(wanted).await.unwrap();
-        crate::broker::until("the broker answers", || {
+        until("the broker answers", || {
             self.received().granted.len() == before + filters.len()
         })
         .await;

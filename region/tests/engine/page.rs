@@ -9,9 +9,10 @@ use std::time::Duration;
 use ecod::wire::{NodeState, RegionTopicKind};
 use ecod_region::page::RegionPage;
 use ecod_region::reader::{self, RegionState};
+use ecod_testkit::until;
 use serde_json::Value;
 
-use crate::broker::{Broker, FAR, LOT, until};
+use crate::broker::{Broker, FAR, LOT};
 use crate::cell::Cell;
 
 /// Status and body of an answer.

@@ -5,8 +5,9 @@ use std::sync::{Arc, Mutex};
 
 use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
 use ecod_region::town::RegionTown;
+use ecod_testkit::until;
 
-use crate::broker::{Broker, FAR, LOT, until};
+use crate::broker::{Broker, FAR, LOT};
 use crate::cell::Cell;
 
 /// Topics of messages that arrive at a reader of everything.

@@ -182,18 +182,6 @@ pub(crate) async fn edge_and_vehicle(broker: &BrokerAddress, mqtt: MqttConfig) -
     (edge, euclid)
 }
 
-/// Waits until `reached` without a fixed sleep.
-pub(crate) async fn until(what: &str, reached: impl Fn() -> bool) {
-    let reached = async {
-        while !reached() {
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, reached)
-        .await
-        .unwrap_or_else(|_| panic!("never reached: {what}"));
-}
-
 /// A plain client without ECOD's code.
 pub(crate) struct Stranger {
     client: AsyncClient,

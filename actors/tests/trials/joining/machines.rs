@@ -5,9 +5,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use ecod_testkit::{all_output, until_blocking as until};
 use tempfile::TempDir;
 
-use crate::joining::{Running, said, tokens, until};
+use crate::joining::{Running, tokens};
 use crate::network::{Bridged, namespace};
 
 /// Stands for systemd, which namespaces lack: a service runs by the command of its unit, and is noted as enabled.
@@ -109,8 +110,8 @@ impl Machine {
 
     fn run(&self, line: &str) -> String {
         let output = self.command(line).output().unwrap();
-        assert!(output.status.success(), "{line}: {}", said(&output));
-        said(&output)
+        assert!(output.status.success(), "{line}: {}", all_output(&output));
+        all_output(&output)
     }
 
     /// Starts the node by the command that `init` or `join` printed.
