@@ -22,7 +22,8 @@ fn config(
     name: &str,
     role: Role,
     seeds: &[&NodeHandle],
-    (toml, state): (&str, Option<&Path>),
+    toml: &str,
+    state: Option<&Path>,
 ) -> NodeConfig {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("node.toml");
@@ -47,13 +48,13 @@ fn config(
 }
 
 async fn start(name: &str, role: Role, seeds: &[&NodeHandle]) -> NodeHandle {
-    node::start(config(name, role, seeds, ("", None)))
+    node::start(config(name, role, seeds, "", None))
         .await
         .unwrap()
 }
 
 async fn start_kept(name: &str, role: Role, seeds: &[&NodeHandle], state: &TempDir) -> NodeHandle {
-    node::start(config(name, role, seeds, ("", Some(state.path()))))
+    node::start(config(name, role, seeds, "", Some(state.path())))
         .await
         .unwrap()
 }
@@ -463,7 +464,7 @@ async fn contradicting_file_is_reported() {
     let state = tempfile::tempdir().unwrap();
     let edge = start("edge", Role::Edge, &[]).await;
     let own = described(&["mine", "slot-1"], "");
-    let gauss_config = config("gauss", Role::Cav, &[&edge], (&own, Some(state.path())));
+    let gauss_config = config("gauss", Role::Cav, &[&edge], &own, Some(state.path()));
     let gauss = node::start(gauss_config.clone()).await.unwrap();
     all_follow(&[&edge, &gauss]).await;
     set(described(&["slot-0", "slot-1"], ""), &edge).await;
@@ -509,7 +510,8 @@ async fn contradicting_file_is_reported() {
         "euclid",
         Role::Auto,
         &[&edge],
-        ("[fusion.pace]\ngate_m = 0.7", None),
+        "[fusion.pace]\ngate_m = 0.7",
+        None,
     ))
     .await
     .unwrap();
@@ -554,7 +556,8 @@ async fn contradicting_candidate_leads_last() {
         "noether",
         Role::Auto,
         &[&edge],
-        (&described(&["mine"], ""), None),
+        &described(&["mine"], ""),
+        None,
     );
     of_its_own.election.priority = 200;
     let noether = node::start(of_its_own).await.unwrap();
@@ -592,7 +595,7 @@ async fn starting_description_replaces_no_later() {
     std::fs::write(&file, described(&["slot-0"], "")).unwrap();
     let with_file = || NodeConfig {
         description: Some(file.clone()),
-        ..config("edge", Role::Edge, &[], ("", Some(state.path())))
+        ..config("edge", Role::Edge, &[], "", Some(state.path()))
     };
     let edge = node::start(with_file()).await.unwrap();
     map_where(&edge, "of the file", |map| places(map) == ["slot-0"]).await;

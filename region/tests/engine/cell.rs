@@ -18,7 +18,7 @@ use rumqttc::{AsyncClient, Event, LastWill, Packet, QoS, SubscribeFilter, Subscr
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use crate::broker::Broker;
+use crate::broker::{Broker, PlacedCell};
 
 /// A cell's connection, and what came on it.
 pub(crate) struct Cell {
@@ -40,17 +40,14 @@ pub(crate) struct Received {
 
 impl Cell {
     /// Connects as this user.
-    pub(crate) fn connect(
-        broker: &Broker,
-        (name, latitude_deg, longitude_deg): (&'static str, f64, f64),
-    ) -> Self {
+    pub(crate) fn connect(broker: &Broker, cell: PlacedCell) -> Self {
         let origin = GeographicOrigin {
-            latitude_deg,
-            longitude_deg,
+            latitude_deg: cell.latitude_deg,
+            longitude_deg: cell.longitude_deg,
             height_m: 0.0,
             rotation_deg: 0.0,
         };
-        let (client, mut events) = AsyncClient::new(broker.login(name).options(), 4096);
+        let (client, mut events) = AsyncClient::new(broker.login(cell.name).options(), 4096);
         let received = Arc::new(Mutex::new(Received::default()));
         let noted = Arc::clone(&received);
         let polling = tokio::spawn(async move {
@@ -82,7 +79,7 @@ impl Cell {
             }
         });
         Self {
-            account: CellAccount::new(NodeName::from_static(name), &origin),
+            account: CellAccount::new(NodeName::from_static(cell.name), &origin),
             origin,
             client,
             received,

@@ -7,7 +7,7 @@ use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
 use ecod_region::town::RegionTown;
 use ecod_testkit::until;
 
-use crate::broker::{Broker, FAR, LOT};
+use crate::broker::{Broker, FAR, LOT, PlacedCell};
 use crate::cell::Cell;
 
 /// Topics of messages that arrive at a reader of everything.
@@ -69,7 +69,7 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         lot.topic(RegionTopicKind::Status),
     ];
     for (topic, retain) in statuses.iter().zip([true, false]) {
-        Cell::vanish(broker, LOT.0, topic, retain).await;
+        Cell::vanish(broker, LOT.name, topic, retain).await;
     }
     until("the own last will arrives", || {
         arrived.lock().unwrap().contains(&statuses[1])
@@ -146,10 +146,14 @@ async fn mosquitto_rights_end_at_tile() {
 }
 
 /// A cell that is added while the server runs.
-const NEW: (&str, f64, f64) = ("new-1", 48.86, 2.30);
+const NEW: PlacedCell = PlacedCell {
+    name: "new-1",
+    latitude_deg: 48.86,
+    longitude_deg: 2.30,
+};
 
 /// Connects a cell, again and again until the server has taken its password.
-async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
+async fn admitted(broker: &Broker, place: PlacedCell) -> Cell {
     let mut cell = Cell::connect(broker, place);
     until("the cell is in", || {
         if cell.received().is_refused {
@@ -166,7 +170,7 @@ async fn adding_cell_disconnects_no_others() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     until("the cell is in", || lot.received().logins == 1).await;
-    broker.add_cell(NEW.0, NEW.1, NEW.2);
+    broker.add_cell(NEW);
     let added = admitted(&broker, NEW).await;
     added.publish(
         &added.topic(RegionTopicKind::Status),
@@ -178,7 +182,7 @@ async fn adding_cell_disconnects_no_others() {
     assert_eq!(lot.received().logins, 1);
 
     // It goes on with the password that it has.
-    broker.renew_password(NEW.0, NEW.1, NEW.2);
+    broker.renew_password(NEW);
     until("who has the former password is shut out", || {
         added.received().is_refused
     })

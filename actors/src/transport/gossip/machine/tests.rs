@@ -69,14 +69,15 @@ impl Cell {
     }
 
     fn start_at(&mut self, node: usize, name: &str, key: &str, run: u64) {
-        self.start_as(node, name, (key, None), run);
+        self.start_as(node, name, key, None, run);
     }
 
     fn start_as(
         &mut self,
         node: usize,
         name: &str,
-        (key, identity): (&str, Option<Identity>),
+        key: &str,
+        identity: Option<Identity>,
         run: u64,
     ) {
         let own = NodeId {
