@@ -193,9 +193,10 @@ impl UplinkState {
     fn update(&mut self, myself: &ActorRef<UplinkMessage>) {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
-        match (leads, self.setup.origin) {
-            (true, None) => troubles.record(TroubleKind::NoOrigin, NO_ORIGIN),
-            _ => troubles.settle(TroubleKind::NoOrigin, None),
+        if leads && self.setup.origin.is_none() {
+            troubles.record(TroubleKind::NoOrigin, NO_ORIGIN);
+        } else {
+            troubles.settle(TroubleKind::NoOrigin, None);
         }
         match (self.setup.origin.filter(|_| leads), self.link.take()) {
             (None, Some(link)) => self.leave(link),

@@ -404,9 +404,12 @@ impl TryCell {
             running.camera = Some(camera);
         }
         let node = node::start(running).await?;
-        let mut page = node.dashboard_address();
-        let page = page.wait_for(Option::is_some).await;
-        let page = page.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
+        let mut address = node.dashboard_address();
+        let page = address
+            .wait_for(Option::is_some)
+            .await
+            .context("the page ended")?
+            .unwrap_or(DEFAULT_ADDRESS);
         if self.vehicles.is_empty() {
             config.membership.bind = node.gossip_address();
         }

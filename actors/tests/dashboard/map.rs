@@ -263,7 +263,8 @@ fn report(
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn unsure_object_fades_and_hides() {
     let mut patient = tracking(0);
-    (patient.fusion.tracks.life_s, patient.fusion.tracks.latent_s) = (60.0, 60.0);
+    patient.fusion.tracks.life_s = 60.0;
+    patient.fusion.tracks.latent_s = 60.0;
     let (node, page) = start(patient).await;
     let browser = Browser::start().await;
     browser.look(1280, 800, "light").await;

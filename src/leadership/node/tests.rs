@@ -722,11 +722,9 @@ fn follower_priority_declares_no_role() {
             no_login: Vec::new(),
         },
     );
-    (
-        message.epoch,
-        message.candidacy.role,
-        message.candidacy.priority,
-    ) = (None, Role::Cav, 100);
+    message.epoch = None;
+    message.candidacy.role = Role::Cav;
+    message.candidacy.priority = 100;
     scene.handle_input(Input::Receive {
         from: name("edge"),
         rights: Rights::NONE,
