@@ -1,5 +1,6 @@
 //! The file that all benchmarks write their figures to, each into a section of its own.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
@@ -54,13 +55,16 @@ impl Figures {
     /// Replaces the section in the file and keeps the others.
     ///
     /// # Panics
-    /// When the file cannot be written.
+    /// When the file cannot be read or written, or has other content than sections.
     pub(crate) fn save(self) {
         let path = std::env::var_os("BENCH_JSON").map_or_else(default_path, PathBuf::from);
-        let read = std::fs::read(&path)
-            .ok()
-            .and_then(|bytes| serde_json::from_slice(&bytes).ok());
-        let mut sections: Map<String, Value> = read.unwrap_or_default();
+        let mut sections: Map<String, Value> = match std::fs::read(&path) {
+            Ok(bytes) => serde_json::from_slice(&bytes).unwrap_or_else(|error| {
+                panic!("{} has no sections of figures: {error}", path.display())
+            }),
+            Err(error) if error.kind() == ErrorKind::NotFound => Map::new(),
+            Err(error) => panic!("cannot read {}: {error}", path.display()),
+        };
         sections.insert(self.section.into(), Value::Object(self.values));
         let text = serde_json::to_string_pretty(&sections).expect("figures are plain numbers");
         std::fs::write(&path, text + "\n")

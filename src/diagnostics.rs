@@ -575,7 +575,7 @@ mod tests {
         assert_eq!(
             shown(&register, at(60)),
             [": no frame", "late: x"],
-            "lapsed ones give way"
+            "ended troubles are evicted"
         );
     }
 
@@ -604,7 +604,7 @@ mod tests {
                 .record(
                     TroubleKind::WrongKey,
                     Some(&about),
-                    "heard with another key",
+                    "received with another key",
                     at(0),
                 )
                 .is_some()
@@ -612,7 +612,7 @@ mod tests {
         assert_eq!(
             lines.count(),
             MAX_OF_STRANGERS + 1,
-            "the last says that there are more"
+            "the last line states that there are more"
         );
         assert!(
             register

@@ -3,7 +3,7 @@
 //! Call [`Neighbours::accept`] with every map of another cell and [`Neighbours::observe_own`] with
 //! every map of this cell. When either call changed the state, pass the objects of
 //! [`Neighbours::near`] to the aggregator by
-//! [`Command::TakeNeighbours`](crate::aggregator::Command::TakeNeighbours). That command is
+//! [`Command::OnNeighbours`](crate::aggregator::Command::OnNeighbours). That command is
 //! recorded, so replays are exact.
 //!
 //! - A cell may report objects in its own tile and within [`COVER_M`] around it. Objects elsewhere

@@ -269,13 +269,13 @@ mod tests {
         assert_eq!(
             choice.observe(None, s(15.5)),
             Some(CellMove::GiveUp(name(1))),
-            "also where no position is known"
+            "also without a position"
         );
         assert_eq!(choice.present(), &name(0));
         assert_eq!(
             choice.observe(Some(&place), s(40.0)),
             None,
-            "it is left alone"
+            "it is unchanged"
         );
         assert_eq!(
             choice.observe(Some(&place), s(46.0)),

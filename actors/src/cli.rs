@@ -20,7 +20,7 @@ mod shell;
 mod status;
 mod top;
 #[cfg(feature = "camera")]
-mod trial;
+mod try_command;
 
 use std::fmt;
 use std::io::{ErrorKind, Write};
@@ -90,7 +90,7 @@ Examples:
   ecod-node try drive.mp4             your own video
   ecod-node try 0 frames --height 2.5 a camera of this machine and a directory of images")]
     #[cfg(feature = "camera")]
-    Try(trial::TryArguments),
+    Try(try_command::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     #[command(after_long_help = "\
 Examples:
@@ -255,7 +255,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
-        // A trial keeps no state.
+        // `try` keeps no state.
         #[cfg(feature = "camera")]
         Some(Command::Try(_)) => "warn,ecod_actors::actors::reputation_keeper=error",
         // The command reports refusals itself.
@@ -268,7 +268,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
         #[cfg(feature = "camera")]
-        Some(Command::Try(arguments)) => trial::run(&arguments),
+        Some(Command::Try(arguments)) => try_command::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
         Some(Command::Status(arguments)) => status::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),

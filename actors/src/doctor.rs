@@ -189,7 +189,7 @@ mod tests {
         assert_eq!(
             std::fs::read_dir(directory.path()).unwrap().count(),
             0,
-            "nothing is left behind"
+            "the test file was removed"
         );
     }
 

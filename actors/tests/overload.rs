@@ -156,7 +156,7 @@ async fn flood_delays_no_other_reports() {
     let flooded = sorted_times(&answers);
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
-    println!("median {quiet_median:?}, during a flood {flooded_median:?}; {left_out} left out");
+    println!("median {quiet_median:?}, during a flood {flooded_median:?}; {left_out} excluded");
     assert!(
         flooded_median < quiet_median + Duration::from_millis(50),
         "{quiet:?} {flooded:?}"

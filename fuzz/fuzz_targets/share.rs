@@ -111,7 +111,7 @@ fn take(
         let before = ledger.clone();
         let merged = resync.merge(share, &mut ledger, &candidates, &leadership, at, at);
         let is_unchanged = before.totals().is_empty() || before.totals() == ledger.totals();
-        assert!(is_another || is_unchanged, "the same again changes nothing");
+        assert!(is_another || is_unchanged, "a repetition has no effect");
         assert!(
             merged.is_ok() || before == ledger,
             "what is refused changes nothing"

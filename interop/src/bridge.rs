@@ -278,22 +278,24 @@ fn described(cell: &Cell) -> Result<Option<CpmCell>, Error> {
     };
     Ok(Some(CpmCell {
         origin,
-        vacancy_signs: vacancy_signs(&cell.description()?.text),
+        vacancy_signs: vacancy_signs(&cell.description()?.text)?,
     }))
 }
 
 /// Labels of the vacancy signs at the landmarks of a description.
-fn vacancy_signs(description: &str) -> BTreeSet<Label> {
-    let settings: toml::Table = description.parse().unwrap_or_default();
+fn vacancy_signs(description: &str) -> Result<BTreeSet<Label>, Error> {
+    let settings: toml::Table = description.parse().map_err(|error| {
+        Error::Invalid(format!("the description of the cell is no TOML: {error}"))
+    })?;
     let landmarks = settings
         .get("landmarks")
         .and_then(toml::Value::as_array)
         .into_iter()
         .flatten();
-    landmarks
+    Ok(landmarks
         .filter_map(|place| place.get("vacancy")?.get("label")?.as_str())
         .map(Label::new)
-        .collect()
+        .collect())
 }
 
 /// Connections in which stations report.
@@ -365,7 +367,11 @@ mod tests {
     fn vacancy_signs_come_from_description() {
         let description = "[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\nvacancy = { label = \"EMPTY\", x_m = 0, y_m = 1 }\n\
                            [[landmarks]]\nid = \"b\"\nx_m = 5\ny_m = 0\n";
-        assert_eq!(vacancy_signs(description), BTreeSet::from(["EMPTY".into()]));
-        assert!(vacancy_signs("[origin]").is_empty());
+        assert_eq!(
+            vacancy_signs(description),
+            Ok(BTreeSet::from(["EMPTY".into()]))
+        );
+        assert_eq!(vacancy_signs("[origin]"), Ok(BTreeSet::new()));
+        assert!(matches!(vacancy_signs("[origin"), Err(Error::Invalid(_))));
     }
 }

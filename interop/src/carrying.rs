@@ -126,13 +126,13 @@ mod tests {
     #[test]
     fn refusals_log_powers_of_ten() {
         let refusals = RefusalCounts::default();
-        let told: Vec<_> = (0..1000)
+        let logged: Vec<_> = (0..1000)
             .chain(0..1000)
             .filter_map(|kind| refusals.record(kind, 9999))
             .collect();
         let first = (0..256).map(|kind| (kind, 1));
         assert_eq!(
-            told,
+            logged,
             first
                 .chain([1, 10, 100, 1000].map(|count| (9999, count)))
                 .collect::<Vec<_>>()
@@ -147,9 +147,9 @@ mod tests {
     #[test]
     fn failure_is_reported_once() {
         let failures = Failures::default();
-        let told = |name| [failures.begins(name), failures.begins(name)];
-        assert_eq!((told("a"), told("b")), ([true, false], [true, false]));
+        let begins = |name| [failures.begins(name), failures.begins(name)];
+        assert_eq!((begins("a"), begins("b")), ([true, false], [true, false]));
         failures.ends("a");
-        assert_eq!((told("a"), told("b")), ([true, false], [false, false]));
+        assert_eq!((begins("a"), begins("b")), ([true, false], [false, false]));
     }
 }

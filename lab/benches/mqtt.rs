@@ -156,7 +156,7 @@ async fn join(
         counters: Arc::new(Counters::default()),
         subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
         seed: 1,
-        looks_on: false,
+        only_observes: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
     gateway.cast(GatewayMessage::SetBrokers {

@@ -203,7 +203,7 @@ impl Evaluation {
     }
 
     /// True if a line so far is on a location of the truth at its time.
-    pub fn meets_truth(&self) -> bool {
+    pub fn matches_truth(&self) -> bool {
         self.pace.rounds.entries + self.vote.rounds.entries > 0
     }
 

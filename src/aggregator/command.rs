@@ -50,7 +50,8 @@ pub enum Command {
         received_at: Timestamp,
     },
     /// [`Aggregator::on_neighbours`].
-    TakeNeighbours {
+    #[serde(rename = "take_neighbours")]
+    OnNeighbours {
         /// All objects of other cells near this one; their times are by the aggregator's clock.
         objects: Arc<[NeighbourObject]>,
         /// Time at which the objects had the ages that they state.
@@ -96,7 +97,7 @@ impl Aggregator {
             Command::StepDown => self.step_down(),
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
-            Command::TakeNeighbours { objects, stated_at } => {
+            Command::OnNeighbours { objects, stated_at } => {
                 self.on_neighbours(objects, *stated_at);
             }
             Command::Resume { reputations } => self.resume(reputations),

@@ -314,7 +314,7 @@ mod tests {
         assert!(!rounds.report(Detections, &node("a"), at(10)));
         assert!(
             rounds.report(Detections, &node("b"), at(20)),
-            "both known vehicles have reported, a fifth of the period is over"
+            "both expected vehicles have reported, a fifth of the period is over"
         );
         assert!(!rounds.report(Detections, &node("a"), at(110)));
         assert!(rounds.report(Detections, &node("b"), at(115)));

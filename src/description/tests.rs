@@ -29,7 +29,7 @@ fn node(own: &str) -> DescriptionExchange {
     DescriptionExchange::new(name(own), true, DescriptionHistory::default())
 }
 
-fn word(may_lead: bool, stamp: DescriptionStamp) -> DescriptionStatement {
+fn statement(may_lead: bool, stamp: DescriptionStamp) -> DescriptionStatement {
     DescriptionStatement {
         stamp,
         may_lead,
@@ -56,19 +56,19 @@ fn body_needs_statement_of_candidate() {
         let taken: Vec<_> = if is_body_first {
             assert_eq!(euclid.on_description(Arc::clone(&new), at(0)), []);
             assert_eq!(
-                euclid.receive(&name("gauss"), word(false, new.stamp()), at(1)),
+                euclid.receive(&name("gauss"), statement(false, new.stamp()), at(1)),
                 [],
-                "a vehicle that never leads"
+                "a vehicle that may not lead"
             );
-            euclid.receive(&name("edge"), word(true, new.stamp()), at(2))
+            euclid.receive(&name("edge"), statement(true, new.stamp()), at(2))
         } else {
             assert_eq!(
-                euclid.receive(&name("edge"), word(true, new.stamp()), at(0)),
+                euclid.receive(&name("edge"), statement(true, new.stamp()), at(0)),
                 []
             );
             assert!(
                 !adopts(&euclid.on_description(described(1, "forged"), at(1))),
-                "nobody stated it"
+                "no node stated it"
             );
             euclid.on_description(Arc::clone(&new), at(2))
         };
@@ -87,7 +87,7 @@ fn body_needs_statement_of_candidate() {
 fn candidates(stamp: DescriptionStamp) -> DescriptionStatement {
     DescriptionStatement {
         may_describe: false,
-        ..word(true, stamp)
+        ..statement(true, stamp)
     }
 }
 
@@ -139,7 +139,11 @@ fn merge_order_does_not_matter() {
         let mut euclid = node("euclid");
         for index in 0..sides.len() {
             let side = &sides[(index + turn) % sides.len()];
-            euclid.receive(&name(&format!("n{index}")), word(true, side.stamp()), at(0));
+            euclid.receive(
+                &name(&format!("n{index}")),
+                statement(true, side.stamp()),
+                at(0),
+            );
             euclid.on_description(Arc::clone(side), at(0));
         }
         assert_eq!(euclid.stamp(), winner, "turn {turn}");
@@ -155,7 +159,7 @@ fn local_change_is_published() {
     );
     euclid.receive(
         &name("edge"),
-        word(true, described(8, "unseen").stamp()),
+        statement(true, described(8, "unseen").stamp()),
         at(0),
     );
     let effects = euclid.set("new".into(), ContentHash([7; 32]), at(1));
@@ -190,7 +194,7 @@ fn version_far_ahead_is_ignored() {
     );
     let far = described(6 + MAX_VERSION_STEP + 1, "far");
     assert_eq!(
-        euclid.receive(&name("edge"), word(true, far.stamp()), at(0)),
+        euclid.receive(&name("edge"), statement(true, far.stamp()), at(0)),
         [CountImplausible { from: name("edge") }]
     );
     assert!(!adopts(&euclid.on_description(far, at(0))));
@@ -201,7 +205,7 @@ fn version_far_ahead_is_ignored() {
         ..Default::default()
     };
     assert_eq!(
-        node("gauss").receive(&name("edge"), word(true, first), at(0)),
+        node("gauss").receive(&name("edge"), statement(true, first), at(0)),
         [CountImplausible { from: name("edge") }]
     );
 }
@@ -220,10 +224,10 @@ fn settable_version_suits_all() {
         version: 6 + MAX_VERSION_STEP,
         hash: ContentHash::default(),
     };
-    euclid.receive(&name("liar"), word(true, boast), at(0));
+    euclid.receive(&name("liar"), statement(true, boast), at(0));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     let set = Arc::clone(euclid.current().unwrap());
-    gauss.receive(&name("euclid"), word(true, set.stamp()), at(2));
+    gauss.receive(&name("euclid"), statement(true, set.stamp()), at(2));
     assert!(adopts(&gauss.on_description(set, at(3))));
 }
 
@@ -238,10 +242,10 @@ fn absent_node_adopts_leaders_version() {
     euclid.lead(Some(&name("edge")), at(0));
     assert!(!adopts(&euclid.receive(
         &name("gauss"),
-        word(true, far.stamp()),
+        statement(true, far.stamp()),
         at(1)
     )));
-    euclid.receive(&name("edge"), word(true, far.stamp()), at(2));
+    euclid.receive(&name("edge"), statement(true, far.stamp()), at(2));
     assert!(adopts(&euclid.on_description(far, at(3))));
 }
 
@@ -252,7 +256,7 @@ fn adoptions_are_limited_per_second() {
     for version in 1..=100 {
         let new = described(version, "new");
         let now = at(version * 10);
-        euclid.receive(&name("liar"), word(true, new.stamp()), now);
+        euclid.receive(&name("liar"), statement(true, new.stamp()), now);
         adopted += u32::from(adopts(&euclid.on_description(new, now)));
     }
     assert_eq!(adopted, 8, "in a second");
@@ -275,12 +279,12 @@ fn leader_repeats_only_while_needed() {
     assert!(!publishes(&edge.tick(at(1500))));
     assert!(publishes(&edge.receive(
         &name("euclid"),
-        word(false, DescriptionStamp::default()),
+        statement(false, DescriptionStamp::default()),
         at(1600)
     )));
     assert!(!publishes(&edge.tick(at(3500))), "not that often");
     assert!(publishes(&edge.tick(at(3600))));
-    edge.receive(&name("euclid"), word(false, held.stamp()), at(3700));
+    edge.receive(&name("euclid"), statement(false, held.stamp()), at(3700));
     assert!(!publishes(&edge.tick(at(9000))));
     assert!(
         publishes(&edge.on_description(described(2, "displaced"), at(9100))),
@@ -299,7 +303,7 @@ fn outdated_node_costs_little() {
     let is_repeated = |ms: &u64| {
         publishes(&edge.receive(
             &name("liar"),
-            word(false, DescriptionStamp::default()),
+            statement(false, DescriptionStamp::default()),
             at(*ms),
         ))
     };
@@ -322,17 +326,17 @@ fn candidate_informs_outdated_leader() {
     );
     assert!(
         !publishes(&euclid.lead(Some(&name("edge")), at(0))),
-        "the leader has not said what it has"
+        "the leader has not stated its version"
     );
     assert!(publishes(&euclid.receive(
         &name("edge"),
-        word(true, DescriptionStamp::default()),
+        statement(true, DescriptionStamp::default()),
         at(100)
     )));
-    euclid.receive(&name("edge"), word(true, held.stamp()), at(200));
+    euclid.receive(&name("edge"), statement(true, held.stamp()), at(200));
     euclid.receive(
         &name("gauss"),
-        word(false, DescriptionStamp::default()),
+        statement(false, DescriptionStamp::default()),
         at(300),
     );
     assert!(
@@ -345,10 +349,10 @@ fn candidate_informs_outdated_leader() {
     assert!(
         !publishes(&gauss.receive(
             &name("edge"),
-            word(true, DescriptionStamp::default()),
+            statement(true, DescriptionStamp::default()),
             at(100)
         )),
-        "it never publishes"
+        "it does not publish"
     );
 }
 
@@ -359,7 +363,7 @@ fn unstated_bodies_are_bounded() {
     euclid.on_description(Arc::clone(&stated), at(0));
     (2..100).for_each(|version| drop(euclid.on_description(described(version, "junk"), at(0))));
     assert_eq!(euclid.unproven.len(), MAX_UNPROVEN);
-    euclid.receive(&name("edge"), word(true, stated.stamp()), at(1));
+    euclid.receive(&name("edge"), statement(true, stated.stamp()), at(1));
     assert!(
         adopts(&euclid.on_description(stated, at(2))),
         "the leader repeats it"
@@ -370,7 +374,7 @@ fn unstated_bodies_are_bounded() {
 fn certified(certificate: &str, stamp: DescriptionStamp) -> DescriptionStatement {
     DescriptionStatement {
         certificate: Some(certificate.into()),
-        ..word(true, stamp)
+        ..statement(true, stamp)
     }
 }
 
@@ -466,7 +470,7 @@ fn node_settings_are_restored() {
         at(0),
     );
     edge.on_description(Arc::clone(&forged), at(0));
-    // A word that was on its way.
+    // A statement that was in transit.
     let late = described(8, "late");
     edge.receive(&name("turing"), certified("turing's", late.stamp()), at(1));
     assert!(adopts(&edge.revoke(
@@ -476,7 +480,7 @@ fn node_settings_are_restored() {
     )));
     assert!(
         !adopts(&edge.on_description(late, at(3))),
-        "nobody states it any more"
+        "no node states it now"
     );
     let empty = edge.current().unwrap();
     assert_eq!(

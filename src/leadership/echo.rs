@@ -54,7 +54,11 @@ mod tests {
             None,
             "many at once are no time"
         );
-        assert_eq!(stalled_at((0..2500).step_by(500)), None, "few say nothing");
+        assert_eq!(
+            stalled_at((0..2500).step_by(500)),
+            None,
+            "few messages are no evidence"
+        );
         assert_eq!(
             stalled_at([0, 60_000, 60_001, 60_100]),
             None,

@@ -245,7 +245,7 @@ mod tests {
         assert!(monitor.record_link(&broker, LinkState::Refused));
         assert!(
             !monitor.record_link(&broker, LinkState::Refused),
-            "told once"
+            "reported once"
         );
     }
 
@@ -325,7 +325,7 @@ mod tests {
             assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
             assert!(
                 monitor.health(&plane, &brokers, true, PERIOD).is_fit(),
-                "nobody else could do better"
+                "no other node could lead better"
             );
         }
     }

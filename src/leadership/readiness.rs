@@ -241,7 +241,7 @@ mod tests {
 
     #[test]
     fn unready_node_names_cause() {
-        let told = |leadership: &Leadership| {
+        let reason_for = |leadership: &Leadership| {
             let judged = Readiness::judge(leadership, None, false, None, Timestamp(0));
             judged
                 .because(Some(
@@ -251,13 +251,13 @@ mod tests {
         };
         let alone =
             "no leader known: received a datagram of cell lot-1 with another key from 10.0.0.7";
-        assert_eq!(told(&Leadership::default()), alone);
+        assert_eq!(reason_for(&Leadership::default()), alone);
         let following = Leadership {
             position: Position::Following,
             epoch: Some(epoch(4)),
             ..Leadership::default()
         };
-        assert_eq!(told(&following), "following edge");
+        assert_eq!(reason_for(&following), "following edge");
     }
 
     #[test]

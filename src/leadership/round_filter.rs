@@ -477,7 +477,7 @@ mod tests {
         assert_eq!(
             take(8, 1, Origin::Claimed, &leadership),
             Ok(()),
-            "nothing is known of it"
+            "the filter has no record of it"
         );
         assert_eq!(take(8, 2, Origin::Proven, &leadership), Ok(()));
         assert_eq!(

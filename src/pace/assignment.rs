@@ -234,7 +234,7 @@ mod tests {
         assert_eq!(
             assigned(&row),
             [(0, 0), (1, 1), (2, 2)],
-            "the nearest gives way, or one has no place"
+            "the nearest is reassigned, or one has no place"
         );
     }
 

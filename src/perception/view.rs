@@ -419,7 +419,7 @@ mod tests {
         );
         assert!(
             sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.06)]),
-            "passes beside"
+            "does not cover the target"
         );
         assert!(
             sees(0.6, 0.0, Some(PI), &[object("QR", 0.58, 0.0)]),

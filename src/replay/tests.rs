@@ -586,7 +586,7 @@ fn named_votes_need_no_position() {
         assert_eq!(
             verdict_labels(&output)["x"].as_deref(),
             Some("cup"),
-            "nobody knows how far x is from the pose"
+            "the distance of x from the pose is unknown"
         );
     }
     for (text, flaw) in [

@@ -394,7 +394,7 @@ mod tests {
             assert!(copy.merge_entries(share.to_vec(), None));
             assert!(
                 !copy.merge_entries(share.to_vec(), None),
-                "the same again changes nothing"
+                "a repetition has no effect"
             );
         }
         assert_eq!(copy, ledger);
@@ -473,7 +473,7 @@ mod tests {
         assert_eq!(
             (vote_of(&own), own.lanes()),
             (Some((1, 0)), MAX_LANES),
-            "later lanes give way"
+            "later lanes are evicted"
         );
         own.merge_entries(flood(9), Some(&present));
         assert_eq!(
@@ -484,10 +484,10 @@ mod tests {
 
         let mut copy = ReputationLedger::default();
         copy.merge_entries(flood(8), None);
-        let told = entry(&present, &name("euclid"), &"cup".into(), counted);
-        assert!(!copy.merge_entries([told.clone()], None));
+        let received = entry(&present, &name("euclid"), &"cup".into(), counted);
+        assert!(!copy.merge_entries([received.clone()], None));
         assert!(
-            copy.merge_entries([told], Some(&present)),
+            copy.merge_entries([received], Some(&present)),
             "nor does it at a later leader"
         );
     }
@@ -517,7 +517,7 @@ mod tests {
         assert_eq!(
             ledger.totals()[&name("euclid")],
             (2, 0),
-            "who is known goes on being counted"
+            "a node with counts is counted further"
         );
     }
 

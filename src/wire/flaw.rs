@@ -208,13 +208,13 @@ mod tests {
             Flaw::of_report(json, RejectReason::NotFinite, &limits).to_string(),
             "objects[0].x_m: is NaN"
         );
-        for (junk, told) in [
+        for (junk, expected) in [
             (&b"junk"[..], "expected value, at column 1"),
             (b"\xff\xfe", "is neither JSON nor CBOR"),
         ] {
             assert_eq!(
                 Flaw::of_report(junk, RejectReason::Malformed, &limits).to_string(),
-                told
+                expected
             );
         }
         let mismatch = Flaw::of_report(
@@ -225,7 +225,7 @@ mod tests {
         assert_eq!(
             mismatch.to_string(),
             "node_mismatch",
-            "a report that cannot be read names nobody"
+            "an unreadable report names no node"
         );
         let readable = encode(
             &ObjectReport {

@@ -19,5 +19,5 @@ pub use config::{free_gossip_address, greet, loopback, name, node_config};
 pub use help::help_of;
 pub use member::{Member, member_config};
 pub use people::walking_people;
-pub use program::{command, output_of};
-pub use wait::{PATIENCE, until, until_by};
+pub use program::{all_output, command, example, output_of, stderr};
+pub use wait::{PATIENCE, until, until_async, until_blocking, until_by};

@@ -224,9 +224,9 @@ fn emptiness_needs_observer() {
     assert_eq!(
         round.landmarks[0].observers,
         [NodeName::new("a").unwrap()],
-        "looked at and known to be empty"
+        "observed and empty"
     );
-    assert!(round.landmarks[1].observers.is_empty(), "never looked at");
+    assert!(round.landmarks[1].observers.is_empty(), "not observed");
     assert_eq!(round.landmarks[0].confidence, 0.0);
 }
 

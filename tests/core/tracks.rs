@@ -363,7 +363,7 @@ fn contradicted_invention_is_no_fact() {
             Timestamp(START),
         );
         let mut maps = 0;
-        let mut believed = 0;
+        let mut accepted = 0;
         for frame in 1..=200 {
             let at = Timestamp(START + frame * 100_000);
             let mut fused = Vec::new();
@@ -408,10 +408,10 @@ fn contradicted_invention_is_no_fact() {
                     (object.x_m - 20.0).hypot(object.y_m) < 3.0
                         && object.existence.unwrap_or(1.0) > 0.5
                 });
-                believed += u32::from(known || tracked);
+                accepted += u32::from(known || tracked);
             }
         }
-        shares.push(f64::from(believed) / f64::from(maps));
+        shares.push(f64::from(accepted) / f64::from(maps));
     }
     println!("{shares:.3?} of the maps at a known location, and elsewhere");
     assert!(shares.iter().all(|share| *share < 0.05), "{shares:?}");

@@ -515,7 +515,7 @@ impl Model for CellModel {
 
     fn properties(&self) -> Vec<Property<Self>> {
         vec![
-            Property::always("never two leaderships with one epoch", |_, cell: &Cell| {
+            Property::always("no two leaderships have one epoch", |_, cell: &Cell| {
                 cell.led.values().all(|count| *count == 1)
             }),
             Property::always(
@@ -524,7 +524,7 @@ impl Model for CellModel {
             ),
             // But to the elected leader's, and to a lone publisher's after a while without any round.
             Property::always(
-                "terms accepted by a node never go back, restarts included",
+                "terms accepted by a node do not go back, restarts included",
                 |_, cell: &Cell| !cell.went_back,
             ),
             Property::always("no round is accepted twice in a row", |_, cell: &Cell| {
@@ -567,9 +567,9 @@ fn settled(nodes: usize) -> Vec<Cell> {
 }
 
 fn everything_holds(checker: &impl Checker<CellModel>) {
-    checker.assert_no_discovery("never two leaderships with one epoch");
+    checker.assert_no_discovery("no two leaderships have one epoch");
     checker.assert_no_discovery("the term is on disk before it is led in");
-    checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
+    checker.assert_no_discovery("terms accepted by a node do not go back, restarts included");
     checker.assert_no_discovery("no round is accepted twice in a row");
     checker.assert_no_discovery("a quiet component converges");
 }
@@ -615,6 +615,6 @@ fn four_nodes_in_random_orders() {
     everything_holds(&checker);
     assert!(
         checker.discovery("two lead at once").is_some(),
-        "the walks never split the cell"
+        "the walks do not split the cell"
     );
 }

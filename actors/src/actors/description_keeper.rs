@@ -3,8 +3,8 @@
 //!
 //! ```text
 //! program ── door ── Set ──────────> DescriptionKeeper ── PublishDescription ──> Gateway
-//! LeaderElection ── Hear ──────────>   │ ▲        └── Describe ──> Node ──> the parts that use its settings
-//! Gateway ── Take, Connected ──────>   └─┘ Tick
+//! LeaderElection ── HandleStamp ───>   │ ▲        └── Describe ──> Node ──> the parts that use its settings
+//! Gateway ── HandleDescription, … ─>   └─┘ Tick
 //! ```
 
 use std::sync::Arc;
@@ -156,16 +156,20 @@ impl Actor for DescriptionKeeper {
             state.carry_out(effects);
         }
         let effects = match message {
-            DescriptionKeeperMessage::Hear {
+            DescriptionKeeperMessage::HandleStamp {
                 from,
                 may_lead,
                 may_describe,
                 stamp,
             } => state.receive(&from, may_lead, may_describe, stamp, now),
-            DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => state
-                .exchange
-                .on_description(Arc::clone(&delivery.message), now),
-            DescriptionKeeperMessage::Take { delivery } => {
+            DescriptionKeeperMessage::HandleDescription { delivery }
+                if is_intact(&delivery.message) =>
+            {
+                state
+                    .exchange
+                    .on_description(Arc::clone(&delivery.message), now)
+            }
+            DescriptionKeeperMessage::HandleDescription { delivery } => {
                 let broker = delivery.broker.as_ref().map_or(OTHERS, NodeName::as_str);
                 state.counters.reject(RejectReason::Malformed, broker);
                 tracing::debug!(

@@ -455,7 +455,7 @@ mod tests {
         };
         timeout(Duration::from_secs(60), until(true))
             .await
-            .expect("it is told");
+            .expect("no trouble was reported");
         drop(done);
         timeout(Duration::from_secs(60), until(false))
             .await

@@ -1,10 +1,10 @@
 //! The actor that accepts the cell's maps, verdicts and reputations.
 //!
 //! ```text
-//! Gateway ── TakeMap, TakeVerdicts, … ──> Follower ──> watch channels with the newest message of each kind; maps also to an optional log file
-//!                                            ├── RoundAccepted ──> LeaderElection
-//!                                            ├── TakeMap ──> Fuser
-//!                                            └── everything accepted ──> Door ──> programs beside the node
+//! Gateway ── HandleMap, HandleVerdicts, … ──> Follower ──> watch channels with the newest message of each kind; maps also to an optional log file
+//!                                                  ├── RoundAccepted ──> LeaderElection
+//!                                                  ├── HandleMap ──> Fuser
+//!                                                  └── everything accepted ──> Door ──> programs beside the node
 //! ```
 //!
 //! It owns the node's [`RoundFilter`], which decides by the current leadership. Each map is
@@ -108,15 +108,15 @@ impl Actor for Follower {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let (taken, sender) = match message {
-            FollowerMessage::TakeMap { delivery } => (
+            FollowerMessage::HandleMap { delivery } => (
                 state.on_map(&delivery),
                 Some(delivery.message.aggregator.clone()),
             ),
-            FollowerMessage::TakeVerdicts { delivery } => (
+            FollowerMessage::HandleVerdicts { delivery } => (
                 state.on_verdicts(&delivery),
                 Some(delivery.message.aggregator.clone()),
             ),
-            FollowerMessage::TakeReputations { delivery } => (
+            FollowerMessage::HandleReputations { delivery } => (
                 state.on_reputations(&delivery),
                 delivery.message.aggregator.clone(),
             ),
@@ -190,7 +190,7 @@ impl FollowerState {
         let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         if accepted.is_known_term {
-            self.fuser.send(FuserMessage::TakeMap {
+            self.fuser.send(FuserMessage::HandleMap {
                 map: Arc::clone(map),
                 received_at,
             });

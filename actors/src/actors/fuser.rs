@@ -2,9 +2,9 @@
 //!
 //! ```text
 //! Gateway ── reports ──> LatestReportQueue ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
-//! Gateway ── TakeReports ──────────> │ ▲
-//! Follower ── TakeMap ─────────────> │ │
-//! Uplink ── TakeNeighbours ────────> │ │
+//! Gateway ── HandleReports ────────> │ ▲
+//! Follower ── HandleMap ───────────> │ │
+//! Uplink ── HandleNeighbours ──────> │ │
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
@@ -115,8 +115,8 @@ impl Actor for Fuser {
     ) -> Result<(), ActorProcessingErr> {
         state.follow_clock();
         match message {
-            FuserMessage::TakeReports => state.drain_reports(),
-            FuserMessage::TakeMap { map, received_at } => state.on_map(map, received_at),
+            FuserMessage::HandleReports => state.drain_reports(),
+            FuserMessage::HandleMap { map, received_at } => state.on_map(map, received_at),
             FuserMessage::Expel { node } => state.expel(&node),
             FuserMessage::CloseRound => {
                 state.counters.count(Event::RoundDue);
@@ -142,8 +142,8 @@ impl Actor for Fuser {
             FuserMessage::Configure { fusion, landmarks } => {
                 state.command(Command::Configure { fusion, landmarks });
             }
-            FuserMessage::TakeNeighbours { objects, stated_at } => {
-                state.command(Command::TakeNeighbours { objects, stated_at });
+            FuserMessage::HandleNeighbours { objects, stated_at } => {
+                state.command(Command::OnNeighbours { objects, stated_at });
             }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),

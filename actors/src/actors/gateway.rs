@@ -68,7 +68,7 @@ pub struct GatewayArguments {
     /// Seed of the jitter between connection attempts.
     pub seed: u64,
     /// True if the node only observes: after it has stopped, the brokers have no status of it.
-    pub looks_on: bool,
+    pub only_observes: bool,
 }
 
 /// The only owner of MQTT clients.
@@ -81,7 +81,7 @@ pub struct GatewayState {
     role: SubscriptionRole,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
-    looks_on: bool,
+    only_observes: bool,
     /// True if reports are subscribed to on every broker.
     watches_reports: bool,
     status: NodeStatus,
@@ -195,7 +195,7 @@ impl Actor for Gateway {
             ..state.status.clone()
         };
         state.set_status(gone);
-        if state.looks_on {
+        if state.only_observes {
             state.send(&state.status_topic, &Bytes::new(), Retention::Retained);
         }
         for link in std::mem::take(&mut state.links).into_values() {
@@ -229,7 +229,7 @@ impl GatewayState {
             counters,
             subscriber,
             seed,
-            looks_on,
+            only_observes,
         } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
@@ -274,7 +274,7 @@ impl GatewayState {
         };
         Self {
             inbox,
-            looks_on,
+            only_observes,
             report_brokers: None,
             watches_reports: false,
             topics,
@@ -375,14 +375,14 @@ impl GatewayState {
             .values()
             .filter(|link| !self.takes_reports_of(&link.broker))
         {
-            let told = link.client.as_ref().map(|client| {
+            let queued = link.client.as_ref().map(|client| {
                 if wanted {
                     client.subscribe(&reports, MaxQos::AtLeastOnce)
                 } else {
                     client.unsubscribe(&reports)
                 }
             });
-            tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");
+            tracing::debug!(broker = %link.broker, wanted, ?queued, "subscription to reports changed");
         }
     }
 

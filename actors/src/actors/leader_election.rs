@@ -136,7 +136,7 @@ impl Actor for LeaderElection {
     ) -> Result<(), ActorProcessingErr> {
         match message {
             LeaderElectionMessage::Membership { event } => driver.on_membership_event(event).await,
-            LeaderElectionMessage::TakeStatus { delivery } => {
+            LeaderElectionMessage::HandleStatus { delivery } => {
                 driver.on_status(&delivery.message).await;
             }
             LeaderElectionMessage::Record { input } => driver.handle(input).await,

@@ -1,7 +1,7 @@
 //! The actor that receives a moving vehicle's poses from its localisation, one pose per datagram.
 //!
 //! ```text
-//! localisation ── UDP ──> PoseReceiver ── TakePose ──> Projector of each camera
+//! localisation ── UDP ──> PoseReceiver ── HandlePose ──> Projector of each camera
 //!                              └─ latest poses ──> choice of the cell
 //! ```
 
@@ -90,12 +90,12 @@ impl Actor for PoseReceiver {
     async fn handle(
         &self,
         _myself: ActorRef<Self::Msg>,
-        PoseReceiverMessage::Take { at, pose }: Self::Msg,
+        PoseReceiverMessage::HandlePose { at, pose }: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         #[cfg(feature = "camera")]
         for projector in &state.arguments.projectors {
-            projector.send(ProjectorMessage::TakePose { at, pose });
+            projector.send(ProjectorMessage::HandlePose { at, pose });
         }
         state.arguments.poses.send_modify(|poses| {
             if poses.len() == KEPT_POSES {
@@ -152,7 +152,7 @@ async fn receive(
         };
         match pose {
             // The listener ends with the receiver.
-            Ok((at, pose)) => _ = receiver.cast(PoseReceiverMessage::Take { at, pose }),
+            Ok((at, pose)) => _ = receiver.cast(PoseReceiverMessage::HandlePose { at, pose }),
             Err(reason) => {
                 counters.count(Event::PoseRejected);
                 if !std::mem::replace(&mut is_logged, true) {

@@ -1,7 +1,7 @@
 //! The actor that places detections in the world and publishes them as reports.
 //!
 //! ```text
-//! PoseReceiver ── TakePose ─────────────────────┐
+//! PoseReceiver ── HandlePose ───────────────────┐
 //! Detector ── Report ────────────────────────> Projector ── PublishReport ──> Gateway
 //!                                                    └─ frame with boxes ─> CameraFeed, while a browser looks
 //! ```
@@ -162,7 +162,7 @@ impl Actor for Projector {
                 state.algorithms = algorithms;
                 state.move_to(origin);
             }
-            ProjectorMessage::TakePose { at, pose } => state.on_pose(at, &pose),
+            ProjectorMessage::HandlePose { at, pose } => state.on_pose(at, &pose),
         }
         Ok(())
     }

@@ -1,10 +1,10 @@
 //! The actor that connects the cell to a region of cells, while its node leads.
 //!
 //! ```text
-//! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
-//! LeaderElection ── SetStatus ─────────────────────> │ ▲
-//! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
-//!                                                    └── TakeNeighbours ──> Fuser
+//! watches of leadership and newest map ── Update ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
+//! LeaderElection ── SetStatus ───────────────────────> │ ▲
+//! Node ── Configure ─────────────────────────────────> │ └── HandleRegionMessage ── RegionInbox ◄── maps of the tiles around ──┘
+//!                                                      └── HandleNeighbours ──> Fuser
 //! ```
 //!
 //! - The cell does not depend on the uplink: without the region the cell continues, and maps are
@@ -142,7 +142,7 @@ impl Actor for Uplink {
                 origin,
                 description,
             } => state.configure(origin, description, &myself),
-            UplinkMessage::Take { delivery } => match delivery.message {
+            UplinkMessage::HandleRegionMessage { delivery } => match delivery.message {
                 FromRegion::Map { topic, map } => {
                     state.on_map(&topic, *map, delivery.received_at);
                 }
@@ -193,9 +193,10 @@ impl UplinkState {
     fn update(&mut self, myself: &ActorRef<UplinkMessage>) {
         let leads = self.setup.leadership.borrow().is_leading();
         let troubles = self.setup.counters.troubles();
-        match (leads, self.setup.origin) {
-            (true, None) => troubles.record(TroubleKind::NoOrigin, NO_ORIGIN),
-            _ => troubles.settle(TroubleKind::NoOrigin, None),
+        if leads && self.setup.origin.is_none() {
+            troubles.record(TroubleKind::NoOrigin, NO_ORIGIN);
+        } else {
+            troubles.settle(TroubleKind::NoOrigin, None);
         }
         match (self.setup.origin.filter(|_| leads), self.link.take()) {
             (None, Some(link)) => self.leave(link),
@@ -213,8 +214,9 @@ impl UplinkState {
     fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
         let receiver = myself.clone();
         // An uplink that has ended needs no events.
-        let subscriber =
-            Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
+        let subscriber = Box::new(move |delivery| {
+            _ = receiver.cast(UplinkMessage::HandleRegionMessage { delivery });
+        });
         let limits = self.connection.limits();
         let counters = Arc::clone(&self.setup.counters);
         let sink = RegionInbox::new(
@@ -428,7 +430,7 @@ impl UplinkState {
         neighbours.observe_own(map, now);
         if std::mem::take(&mut self.has_news) {
             let objects = neighbours.near(now).into();
-            self.setup.fuser.send(FuserMessage::TakeNeighbours {
+            self.setup.fuser.send(FuserMessage::HandleNeighbours {
                 objects,
                 stated_at: now,
             });

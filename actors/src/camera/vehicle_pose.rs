@@ -242,14 +242,14 @@ mod tests {
     #[test]
     fn pose_time_defaults_to_receipt() {
         let now = Timestamp(7);
-        let told = read_pose(
+        let pose_read = read_pose(
             br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#,
             now,
             2,
         )
         .unwrap();
         assert_eq!(
-            told,
+            pose_read,
             (Timestamp(3), StatedPose::InMap(Pose::new(1.0, -2.5, 3.1)))
         );
         assert_eq!(
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn earth_pose_is_in_degrees() {
-        let told = read_pose(
+        let pose_read = read_pose(
             br#"{"latitude_deg":52.2,"longitude_deg":21,"azimuth_deg":270,"captured_at_us":5}"#,
             Timestamp(7),
             0,
@@ -273,14 +273,14 @@ mod tests {
             height_m: None,
             azimuth_deg: 270.0,
         };
-        assert_eq!(told, Ok((Timestamp(5), StatedPose::OnEarth(pose))));
+        assert_eq!(pose_read, Ok((Timestamp(5), StatedPose::OnEarth(pose))));
     }
 
     #[test]
     fn metric_pose_accepts_compass_heading() {
         let south = StatedPose::ByCompass(Point2::new(1.0, 6.0), 180.0);
-        let told = read_pose(br#"{"x_m":1,"y_m":6,"azimuth_deg":180}"#, Timestamp(7), 0);
-        assert_eq!(told, Ok((Timestamp(7), south)));
+        let pose_read = read_pose(br#"{"x_m":1,"y_m":6,"azimuth_deg":180}"#, Timestamp(7), 0);
+        assert_eq!(pose_read, Ok((Timestamp(7), south)));
         let configured: PoseConfig = toml::from_str("x_m = 1\ny_m = 6\nazimuth_deg = 180").unwrap();
         assert_eq!(configured.validate(), Ok(()));
         assert_eq!(configured.stated(), south);

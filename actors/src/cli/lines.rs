@@ -67,7 +67,9 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         bail!("cannot read {}: it is a device, not a file", path.display());
     }
     let mut source = BufReader::with_capacity(1 << 18, file);
-    let begin = source.fill_buf().unwrap_or_default();
+    let begin = source
+        .fill_buf()
+        .with_context(|| format!("cannot read {}", path.display()))?;
     if WIDE_MARKS.iter().any(|mark| begin.starts_with(mark)) {
         bail!(
             "cannot read {}: it is text in UTF-16, save it as UTF-8",
@@ -138,6 +140,13 @@ mod tests {
         let mut line = String::new();
         open(&read).unwrap().read_line(&mut line).unwrap();
         assert_eq!(line, "first\n");
+    }
+
+    #[test]
+    fn unreadable_file_is_named() {
+        // Address 0 of a process is not readable.
+        let error = open(Path::new("/proc/self/mem")).err().unwrap();
+        assert_eq!(error.to_string(), "cannot read /proc/self/mem");
     }
 
     #[test]

@@ -222,7 +222,7 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
             "environment variables that begin with ECOD_ but name no key are left out"
         );
     }
-    let announced = (!config.looks_on()).then(|| config.clone());
+    let announced = (!config.only_observes()).then(|| config.clone());
     let mut vehicle = Roamer::start(config).await?;
     if let Some(config) = announced {
         let page = vehicle.present().dashboard_address();

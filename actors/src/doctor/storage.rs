@@ -120,7 +120,14 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     if !absolute(file).starts_with(SERVICE_CONFIGURATION) {
         return Vec::new();
     }
-    let writable = [vec![PathBuf::from(SERVICE_STATE)], unit_paths()].concat();
+    let mut writable = vec![PathBuf::from(SERVICE_STATE)];
+    let unknown = match unit_paths() {
+        Ok(paths) => {
+            writable.extend(paths);
+            None
+        }
+        Err(error) => Some(error),
+    };
     let record = config.record.as_ref().map(|record| &record.dir);
     let paths = [
         ("state_dir", config.state_dir.as_ref()),
@@ -134,7 +141,12 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
         written.filter(|(_, path)| !writable.iter().any(|writable| path.starts_with(writable)));
     let finding = |(key, path): (&str, PathBuf)| {
         let path = path.display();
-        let seen = format!("the unit does not let the service write {path}");
+        let seen = match &unknown {
+            None => format!("the unit does not let the service write {path}"),
+            Some(error) => format!(
+                "the unit may not let the service write {path}; its ReadWritePaths= are unknown: {error}"
+            ),
+        };
         let fix = format!(
             "set `{key}` to a path below {SERVICE_STATE}, or add ReadWritePaths= with `systemctl edit ecod-node`"
         );
@@ -144,19 +156,22 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 }
 
 /// Writable paths that the operator added to the unit, according to systemd.
-fn unit_paths() -> Vec<PathBuf> {
+fn unit_paths() -> io::Result<Vec<PathBuf>> {
     let arguments = ["show", "--property=ReadWritePaths", "--value", "ecod-node"];
     let answer = Command::new("systemctl")
         .args(arguments)
         .output()
-        .map(|answer| answer.stdout)
-        .unwrap_or_default();
+        .map_err(|error| io::Error::new(error.kind(), format!("systemctl: {error}")))?;
+    if !answer.status.success() {
+        let reason = String::from_utf8_lossy(&answer.stderr);
+        return Err(io::Error::other(format!("systemctl: {}", reason.trim())));
+    }
     // A prefix sets how systemd treats a missing path.
-    let paths = String::from_utf8_lossy(&answer);
-    paths
+    let paths = String::from_utf8_lossy(&answer.stdout);
+    Ok(paths
         .split_whitespace()
         .map(|path| path.trim_start_matches(['-', '+']).into())
-        .collect()
+        .collect())
 }
 
 fn absolute(path: &Path) -> PathBuf {

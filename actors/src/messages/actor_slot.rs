@@ -109,7 +109,9 @@ pub(crate) mod listening {
             message: M,
             sender: &mut Self::State,
         ) -> Result<(), ActorProcessingErr> {
-            sender.send(message).map_err(|_| "nobody reads".into())
+            sender
+                .send(message)
+                .map_err(|_| "the receiver was dropped".into())
         }
     }
 

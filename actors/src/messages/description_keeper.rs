@@ -12,7 +12,7 @@ use crate::transport::mqtt::Delivery;
 #[derive(Debug)]
 pub enum DescriptionKeeperMessage {
     /// Process a node's authenticated statement about its description.
-    Hear {
+    HandleStamp {
         /// Name of the node.
         from: NodeName,
         /// True if it may lead.
@@ -22,8 +22,8 @@ pub enum DescriptionKeeperMessage {
         /// The version and hash that it has.
         stamp: DescriptionStamp,
     },
-    /// Take a description from a broker.
-    Take {
+    /// Process a description from a broker.
+    HandleDescription {
         /// The description and its path of delivery.
         delivery: Delivery<Arc<CellDescription>>,
     },

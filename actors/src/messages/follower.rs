@@ -10,17 +10,17 @@ use crate::transport::mqtt::Delivery;
 #[derive(Debug)]
 pub enum FollowerMessage {
     /// A map of a closed round.
-    TakeMap {
+    HandleMap {
         /// The map and its time of receipt.
         delivery: Delivery<Arc<GlobalMap>>,
     },
     /// Verdicts of a closed round.
-    TakeVerdicts {
+    HandleVerdicts {
         /// The verdicts and their time of receipt.
         delivery: Delivery<Arc<Verdicts>>,
     },
     /// Reputations, possibly retained by a broker.
-    TakeReputations {
+    HandleReputations {
         /// The reputations and their time of receipt.
         delivery: Delivery<Arc<Reputations>>,
     },

@@ -19,10 +19,10 @@ use ractor::RpcReplyPort;
 #[derive(Debug)]
 pub enum FuserMessage {
     /// Fuse the reports that wait in its queue.
-    TakeReports,
+    HandleReports,
     /// Keep another aggregator's map, which the follower accepted, to continue from it when
     /// leading.
-    TakeMap {
+    HandleMap {
         /// The map as the follower accepted it.
         map: Arc<GlobalMap>,
         /// Time of receipt by this node's clock.
@@ -35,7 +35,7 @@ pub enum FuserMessage {
         node: NodeName,
     },
     /// Show these objects of other cells, and take over their identities.
-    TakeNeighbours {
+    HandleNeighbours {
         /// All that are near this cell; their times are by this node's clock.
         objects: Arc<[NeighbourObject]>,
         /// Time at which the objects had the ages that they state.

@@ -17,7 +17,7 @@ pub enum LeaderElectionMessage {
         event: MembershipEvent,
     },
     /// A broker forwarded a status.
-    TakeStatus {
+    HandleStatus {
         /// Another node's status, or its last will, and its place in the queue.
         delivery: Delivery<Arc<NodeStatus>>,
     },

@@ -6,8 +6,8 @@ use ecod::model::time::Timestamp;
 /// Requests to the receiver of poses.
 #[derive(Debug)]
 pub enum PoseReceiverMessage {
-    /// Take a pose of the vehicle.
-    Take {
+    /// Process a pose of the vehicle.
+    HandlePose {
         /// Time of the pose by the clock that stamps frames.
         at: Timestamp,
         /// Pose of the vehicle at that time.

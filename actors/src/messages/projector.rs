@@ -35,8 +35,8 @@ pub enum ProjectorMessage {
         /// Algorithms to report for.
         algorithms: Algorithms,
     },
-    /// Take a pose of the vehicle.
-    TakePose {
+    /// Process a pose of the vehicle.
+    HandlePose {
         /// Time of the pose by the clock that stamps frames.
         at: Timestamp,
         /// Pose in the cell's frame or on Earth.

@@ -26,8 +26,8 @@ pub enum UplinkMessage {
         /// The description of the cell.
         description: Option<Arc<CellDescription>>,
     },
-    /// Take a message of the region.
-    Take {
+    /// Process a message of the region.
+    HandleRegionMessage {
         /// The message and its time of receipt.
         delivery: Delivery<FromRegion>,
     },

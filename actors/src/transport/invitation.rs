@@ -217,7 +217,7 @@ mod tests {
         assert_eq!(
             timeout(SOON, serving).await.unwrap().unwrap(),
             [],
-            "nobody is waited for"
+            "the host does not wait"
         );
         assert!(matches!(
             redeem(&token).await,
@@ -261,7 +261,7 @@ mod tests {
         let second = redeem(&token).await.unwrap();
         // Its certificate is already revoked, so its message does not count as the node's.
         first.keep().await.unwrap();
-        let told = |text: &str| {
+        let was_reported = |text: &str| {
             visits
                 .lock()
                 .unwrap()
@@ -269,14 +269,14 @@ mod tests {
                 .any(|visit| visit.contains(text))
         };
         let deadline = Instant::now() + SOON;
-        while !told("used again") {
+        while !was_reported("used again") {
             assert!(Instant::now() < deadline, "{:?}", visits.lock().unwrap());
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        assert!(told("UsedAgain"));
+        assert!(was_reported("UsedAgain"));
         second.keep().await.unwrap();
         assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), []);
-        assert!(told("Joined") && revoked(&directory) == 1);
+        assert!(was_reported("Joined") && revoked(&directory) == 1);
     }
 
     #[tokio::test]

@@ -3,9 +3,9 @@
 pub(crate) mod config;
 pub(crate) mod connection;
 mod delivery;
-pub(crate) mod hearing;
 pub(crate) mod inbox;
 pub(crate) mod link;
+pub(crate) mod packet_counter;
 pub(crate) mod packet_sink;
 pub(crate) mod probe;
 pub(crate) mod region_inbox;

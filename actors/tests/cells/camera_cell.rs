@@ -146,7 +146,7 @@ async fn each_ended_source_is_trouble() {
         "#
         );
         let node = node::start(toml::from_str(&toml).unwrap()).await.unwrap();
-        let told = async {
+        let trouble_is_reported = async {
             while !node
                 .counters()
                 .troubles()
@@ -157,7 +157,7 @@ async fn each_ended_source_is_trouble() {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
         };
-        timeout(Duration::from_secs(10), told)
+        timeout(Duration::from_secs(10), trouble_is_reported)
             .await
             .expect("the end is reported");
         node.stop().await;

@@ -80,7 +80,7 @@ async fn reported(
     };
     timeout(PATIENCE, settled)
         .await
-        .expect("the map never became as wanted")
+        .expect("the map does not have the expected content")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -359,7 +359,7 @@ async fn top_leaves_when_terminal_closes() {
     top.kill().ok();
     let ended = ended.expect("it ends");
     assert!(ended.success(), "{ended}");
-    assert!(members.borrow().is_empty(), "it has left");
+    assert!(members.borrow().is_empty(), "the member is gone");
     edge.stop().await;
 }
 

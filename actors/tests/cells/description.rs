@@ -22,7 +22,8 @@ fn config(
     name: &str,
     role: Role,
     seeds: &[&NodeHandle],
-    (toml, state): (&str, Option<&Path>),
+    toml: &str,
+    state: Option<&Path>,
 ) -> NodeConfig {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("node.toml");
@@ -47,13 +48,13 @@ fn config(
 }
 
 async fn start(name: &str, role: Role, seeds: &[&NodeHandle]) -> NodeHandle {
-    node::start(config(name, role, seeds, ("", None)))
+    node::start(config(name, role, seeds, "", None))
         .await
         .unwrap()
 }
 
 async fn start_kept(name: &str, role: Role, seeds: &[&NodeHandle], state: &TempDir) -> NodeHandle {
-    node::start(config(name, role, seeds, ("", Some(state.path()))))
+    node::start(config(name, role, seeds, "", Some(state.path())))
         .await
         .unwrap()
 }
@@ -162,7 +163,10 @@ async fn all_follow(nodes: &[&NodeHandle]) {
     for node in nodes {
         let mut members = node.members();
         let all = members.wait_for(|members| members.len() + 1 >= nodes.len());
-        timeout(PATIENCE, all).await.expect("all meet").unwrap();
+        timeout(PATIENCE, all)
+            .await
+            .expect("all nodes are members")
+            .unwrap();
     }
 }
 
@@ -218,10 +222,10 @@ async fn configuration_spreads_within_two_rounds() {
             .starts_with("# cell lot-1: no description\n")
     );
     let nothing = cell("diff", Some(String::new()), &gauss).await;
-    let told = String::from_utf8(nothing.stderr).unwrap();
+    let error_text = String::from_utf8(nothing.stderr).unwrap();
     assert!(
-        nothing.status.code() == Some(1) && told.contains("the cell has no description yet"),
-        "{told}"
+        nothing.status.code() == Some(1) && error_text.contains("the cell has no description yet"),
+        "{error_text}"
     );
 
     let tracked = "[fusion.tracks]\nmode = \"on\"\n";
@@ -424,7 +428,7 @@ async fn merged_cell_uses_later_description() {
         for node in [&edge, &euclid] {
             map_where(node, "alone", |_| true).await;
         }
-        let stamp = |told: &str| told.split_once(", known").unwrap().0.to_owned();
+        let stamp = |error_text: &str| error_text.split_once(", known").unwrap().0.to_owned();
         let mut stamps = [
             stamp(&set(described(&["a"], ""), &edge).await),
             String::new(),
@@ -460,7 +464,7 @@ async fn contradicting_file_is_reported() {
     let state = tempfile::tempdir().unwrap();
     let edge = start("edge", Role::Edge, &[]).await;
     let own = described(&["mine", "slot-1"], "");
-    let gauss_config = config("gauss", Role::Cav, &[&edge], (&own, Some(state.path())));
+    let gauss_config = config("gauss", Role::Cav, &[&edge], &own, Some(state.path()));
     let gauss = node::start(gauss_config.clone()).await.unwrap();
     all_follow(&[&edge, &gauss]).await;
     set(described(&["slot-0", "slot-1"], ""), &edge).await;
@@ -506,37 +510,39 @@ async fn contradicting_file_is_reported() {
         "euclid",
         Role::Auto,
         &[&edge],
-        ("[fusion.pace]\ngate_m = 0.7", None),
+        "[fusion.pace]\ngate_m = 0.7",
+        None,
     ))
     .await
     .unwrap();
     let refused = cell("set", Some("[fusion.pace]\ngate_m = 0.9".into()), &euclid).await;
-    let told = String::from_utf8(refused.stderr).unwrap();
+    let error_text = String::from_utf8(refused.stderr).unwrap();
     assert!(
         !refused.status.success()
             && ["`fusion.pace.gate_m`", "0.7", "0.9"]
                 .iter()
-                .all(|p| told.contains(p)),
-        "{told}"
+                .all(|p| error_text.contains(p)),
+        "{error_text}"
     );
     let vehicle = start("vehicle", Role::Cav, &[&edge]).await;
     let refused = cell("set", Some(described(&["x"], "")), &vehicle).await;
-    let told = String::from_utf8(refused.stderr).unwrap();
+    let error_text = String::from_utf8(refused.stderr).unwrap();
     assert!(
-        told.contains("never leads") && told.lines().count() == 1,
-        "{told}"
+        error_text.contains("never leads") && error_text.lines().count() == 1,
+        "{error_text}"
     );
     let unusable = cell("set", Some("[fusion.pace]\ngate_m = -1".into()), &edge).await;
-    let told = String::from_utf8(unusable.stderr).unwrap();
+    let error_text = String::from_utf8(unusable.stderr).unwrap();
     assert!(
-        unusable.status.code() == Some(2) && told.matches("`fusion.pace.gate_m`").count() == 1,
-        "{told}"
+        unusable.status.code() == Some(2)
+            && error_text.matches("`fusion.pace.gate_m`").count() == 1,
+        "{error_text}"
     );
     let huge = cell("set", Some("#".repeat(256 * 1024 + 1)), &edge).await;
-    let told = String::from_utf8(huge.stderr).unwrap();
+    let error_text = String::from_utf8(huge.stderr).unwrap();
     assert!(
-        huge.status.code() == Some(2) && told.contains("at most 262144 bytes"),
-        "{told}"
+        huge.status.code() == Some(2) && error_text.contains("at most 262144 bytes"),
+        "{error_text}"
     );
     for node in [vehicle, euclid, edge] {
         node.stop().await;
@@ -550,7 +556,8 @@ async fn contradicting_candidate_leads_last() {
         "noether",
         Role::Auto,
         &[&edge],
-        (&described(&["mine"], ""), None),
+        &described(&["mine"], ""),
+        None,
     );
     of_its_own.election.priority = 200;
     let noether = node::start(of_its_own).await.unwrap();
@@ -588,7 +595,7 @@ async fn starting_description_replaces_no_later() {
     std::fs::write(&file, described(&["slot-0"], "")).unwrap();
     let with_file = || NodeConfig {
         description: Some(file.clone()),
-        ..config("edge", Role::Edge, &[], ("", Some(state.path())))
+        ..config("edge", Role::Edge, &[], "", Some(state.path()))
     };
     let edge = node::start(with_file()).await.unwrap();
     map_where(&edge, "of the file", |map| places(map) == ["slot-0"]).await;

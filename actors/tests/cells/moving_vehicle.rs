@@ -16,14 +16,12 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
-use ecod_testkit::{car_ahead, node_config};
+use ecod_testkit::{PATIENCE, car_ahead, node_config, until_async as until};
 use rumqttc::{AsyncClient, Event as Packets, EventLoop, MqttOptions, Packet, QoS};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpStream, UdpSocket};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
-
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// How far ahead the car of [`car_ahead`] stands.
 const AHEAD_M: f64 = 6.6;
@@ -216,17 +214,6 @@ async fn readiness(node: &NodeHandle) -> String {
     answer
 }
 
-async fn until(what: &str, condition: impl AsyncFn() -> bool) {
-    let met = async {
-        while !condition().await {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    };
-    timeout(PATIENCE, met)
-        .await
-        .unwrap_or_else(|_| panic!("not true in time: {what}"));
-}
-
 /// Reads reports until one is from here.
 async fn report_from(
     events: &mut EventLoop,
@@ -302,7 +289,7 @@ async fn earth_poses_use_cell_origin() {
         standing.counters().events(Event::FrameWithoutPose) > 3
     })
     .await;
-    let told = [
+    let parts = [
         "503",
         "`pose.latitude_deg`",
         "no origin",
@@ -310,7 +297,7 @@ async fn earth_poses_use_cell_origin() {
     ];
     until("the trouble is reported", async || {
         let answer = readiness(&standing).await;
-        told.iter().all(|part| answer.contains(part))
+        parts.iter().all(|part| answer.contains(part))
     })
     .await;
 

@@ -480,8 +480,8 @@ async fn vehicle_without_position_reports_trouble() {
     config.pose.listen = Some(loopback());
     config.camera = None;
     let mut vehicle = Roamer::start(config).await.unwrap();
-    let told = timeout(Duration::from_secs(3), vehicle.drive()).await;
-    assert!(told.is_err(), "it drives on");
+    let outcome = timeout(Duration::from_secs(3), vehicle.drive()).await;
+    assert!(outcome.is_err(), "it drives on");
     let troubles = vehicle.present().counters().troubles().present();
     let trouble = troubles
         .iter()

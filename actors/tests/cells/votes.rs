@@ -211,7 +211,7 @@ async fn restarted_node_keeps_reputations() {
 
         let after = edge(keep).await;
         until("reputations", || (), || reputations(&after).is_some()).await;
-        let restored = reputation(&after, "liar").expect("nothing was restored");
+        let restored = reputation(&after, "liar").expect("the reputation was not restored");
         assert!(
             restored.incorrect >= known.incorrect,
             "{mode:?}: {restored:?} after {known:?}"
@@ -359,13 +359,13 @@ async fn next_leader_keeps_reputations() {
 
     // A candidate that joins later receives all evidence.
     let late = member("late", Role::Auto, &standby, |_| ()).await;
-    let tell = || {
+    let send_snapshot = || {
         standby
             .slots()
             .keeper
             .send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
     };
-    until("a snapshot", tell, || {
+    until("a snapshot", send_snapshot, || {
         late.counters().events(Event::LedgerMerged) > 0
     })
     .await;

@@ -46,7 +46,7 @@ async fn browser_follows_new_leader() {
     browser.open(&format!("http://{}/", at_euclid.page)).await;
     browser.until(IS_READY).await;
     println!(
-        "page live {:?} after it was asked for, WebDriver included",
+        "page live {:?} after the request, WebDriver included",
         opened.elapsed()
     );
     browser
@@ -165,10 +165,8 @@ async fn link_signs_in_excess_page_polls() {
     node.stop().await;
 
     let mut crowded = config("gauss", Role::Auto, 1);
-    (
-        crowded.dashboard.max_connections,
-        crowded.dashboard.max_rate_hz,
-    ) = (16, 1.0);
+    crowded.dashboard.max_connections = 16;
+    crowded.dashboard.max_rate_hz = 1.0;
     let (node, page) = cell::start(crowded).await;
     let mut others = Vec::new();
     for _ in 0..8 {

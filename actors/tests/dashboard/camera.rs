@@ -12,9 +12,10 @@ use ecod_actors::camera::image_codec;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::{PATIENCE, until_async as until};
 use opencv::prelude::MatTraitConst;
 
-use crate::cell::{PATIENCE, config, join, start, until};
+use crate::cell::{config, join, start};
 use crate::http::{Events, get};
 use crate::webdriver::Browser;
 

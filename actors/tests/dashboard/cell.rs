@@ -10,11 +10,9 @@ use ecod::wire::{Encoding, FieldOfView, ObjectReport, PerceivedObject, Role, Wir
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
-use ecod_testkit::{loopback, node_config};
+use ecod_testkit::{PATIENCE, loopback, node_config};
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
-
-pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Configuration of a node with a page on a free port, separated from the cells of other tests.
 pub(crate) fn config(name: &str, role: Role, landmarks: usize) -> NodeConfig {
@@ -59,15 +57,6 @@ pub(crate) async fn start(config: NodeConfig) -> (NodeHandle, SocketAddr) {
 pub(crate) async fn join(mut config: NodeConfig, other: &NodeHandle) -> (NodeHandle, SocketAddr) {
     config.membership.seeds = vec![other.gossip_address().unwrap().to_string()];
     start(config).await
-}
-
-/// Waits until it holds.
-pub(crate) async fn until<F: Future<Output = bool>>(what: &str, holds: impl Fn() -> F) {
-    let deadline = tokio::time::Instant::now() + PATIENCE;
-    while !holds().await {
-        assert!(tokio::time::Instant::now() < deadline, "never: {what}");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
 }
 
 /// Vehicles that report ten times a second to some brokers, as vehicles do to leader and standby; ends when dropped.

@@ -4,8 +4,9 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
+use ecod_testkit::until_async as until;
 
-use crate::cell::{Vehicles, until};
+use crate::cell::Vehicles;
 use crate::http::{Events, get, try_request};
 use crate::processes::{free_places, start};
 
@@ -40,7 +41,7 @@ async fn cost_with_32_vehicles() {
     .await;
     let first = Instant::now();
     Events::open(place.page).await.next().await;
-    println!("first picture {:?} after it was asked for", first.elapsed());
+    println!("first picture {:?} after the request", first.elapsed());
     tokio::time::sleep(Duration::from_secs(3)).await;
     for looked_at in [false, true] {
         let mut events = if looked_at {

@@ -5,8 +5,9 @@ use std::net::TcpListener;
 use ecod::wire::Role;
 use ecod_actors::observe::dashboard::{DEFAULT_ADDRESS, DashboardConfig};
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 
-use crate::cell::{config, join, start, until};
+use crate::cell::{config, join, start};
 use crate::http::{get, try_request};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

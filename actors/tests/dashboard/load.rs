@@ -8,11 +8,12 @@ use ecod_actors::node::NodeHandle;
 use ecod_actors::observe::dashboard::DashboardConfig;
 use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::task::JoinSet;
 
-use crate::cell::{Vehicles, config, start, until};
+use crate::cell::{Vehicles, config, start};
 use crate::http::{Events, get, get_with};
 
 /// Longest time between two maps of the node while something goes on.
@@ -198,7 +199,7 @@ async fn pages_leave_room_for_scrapers() {
     assert_eq!(
         get(page, "/api/events").await.status,
         503,
-        "a page too many asks for pictures"
+        "one page too many requests pictures"
     );
     let refused = node.counters().events(Event::BrowserRefused);
     for path in ["/metrics", "/healthz", "/api/picture"] {

@@ -11,10 +11,11 @@ use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::dashboard::{FloorPlanConfig, FloorPlanPoint};
 use ecod_actors::platform::clock;
+use ecod_testkit::until_async as until;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
 
-use crate::cell::{config, start, until};
+use crate::cell::{config, start};
 use crate::http::get;
 use crate::webdriver::Browser;
 
@@ -262,7 +263,8 @@ fn report(
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn unsure_object_fades_and_hides() {
     let mut patient = tracking(0);
-    (patient.fusion.tracks.life_s, patient.fusion.tracks.latent_s) = (60.0, 60.0);
+    patient.fusion.tracks.life_s = 60.0;
+    patient.fusion.tracks.latent_s = 60.0;
     let (node, page) = start(patient).await;
     let browser = Browser::start().await;
     browser.look(1280, 800, "light").await;
@@ -478,12 +480,13 @@ async fn terms_are_explained() {
         .until("document.querySelector('#leader').textContent === 'euclid'")
         .await;
     let terms = "[...document.querySelectorAll('[data-term]')]";
-    let told = format!(
+    let sentences_shown = format!(
         "{terms}.map((it) => document.getElementById(it.getAttribute('aria-describedby')).textContent)"
     );
-    let told: Vec<String> = serde_json::from_value(browser.evaluate(&told).await).unwrap();
-    assert!(told.len() >= 13, "{told:?}");
-    for sentences in &told {
+    let sentences_shown: Vec<String> =
+        serde_json::from_value(browser.evaluate(&sentences_shown).await).unwrap();
+    assert!(sentences_shown.len() >= 13, "{sentences_shown:?}");
+    for sentences in &sentences_shown {
         let longest = sentences
             .split(". ")
             .map(|sentence| sentence.split_whitespace().count())
@@ -493,7 +496,7 @@ async fn terms_are_explained() {
     }
     let tip =
         "(document.querySelector('#tip').hidden ? '' : document.querySelector('#tip').textContent)";
-    for (index, words) in told.iter().enumerate() {
+    for (index, words) in sentences_shown.iter().enumerate() {
         if browser
             .evaluate(&format!("{terms}[{index}].checkVisibility()"))
             .await

@@ -5,9 +5,10 @@ use std::net::SocketAddr;
 
 use ecod::wire::Role;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 use serde_json::Value;
 
-use crate::cell::{Vehicles, config, start, until};
+use crate::cell::{Vehicles, config, start};
 use crate::http::get;
 
 /// Samples by name and labels; every line is checked.
@@ -81,7 +82,7 @@ async fn metrics_describe_node_activity() {
                 .any(|series| series.split('{').next() == Some(name));
             // Their series exist while nodes are missing or there is a trouble, as other tests show.
             let known = known || ["ecod_member_missing_seconds", "ecod_troubles"].contains(&name);
-            assert!(known, "{name} is asked for and does not exist");
+            assert!(known, "{name} is queried and does not exist");
         }
     }
     drop(vehicles);

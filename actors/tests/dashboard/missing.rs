@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
-use ecod_testkit::{Cell, command};
+use ecod_testkit::{Cell, command, until_async as until};
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep};
 
-use crate::cell::{config, until};
+use crate::cell::config;
 use crate::http::get;
 
 /// A node with a page.
@@ -93,8 +93,8 @@ async fn crashed_node_stays_missing() {
     }
     for page in pages {
         until("it is a trouble", || async {
-            let told = troubles(page).await;
-            matches!(&told[..], [[about, cause]] if about == "gauss"
+            let listed = troubles(page).await;
+            matches!(&listed[..], [[about, cause]] if about == "gauss"
                 && cause.starts_with("gone for 1") && cause.contains(", last seen 2"))
         })
         .await;
@@ -110,7 +110,7 @@ async fn crashed_node_stays_missing() {
             missing(page).await.is_empty()
         })
         .await;
-        until("no trouble is left", || async {
+        until("the trouble has ended", || async {
             troubles(page).await.is_empty()
         })
         .await;

@@ -7,13 +7,14 @@ use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::view::PosedCamera;
 use ecod::wire::Role;
+use ecod_testkit::until_async as until;
 use nalgebra::Point2;
 use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use crate::camera::{seeing, seeing_both_ways, shots};
-use crate::cell::{config, start, until};
+use crate::cell::{config, start};
 use crate::http::{Answer, get, request};
 use crate::webdriver::Browser;
 
@@ -186,7 +187,7 @@ async fn points_give_named_camera_mount() {
     assert_eq!(
         post(page, "", "text/plain", &whole).await.status,
         415,
-        "as a foreign page might"
+        "as a page of another origin might"
     );
     assert_eq!(post(page, "", "application/json", "{").await.status, 400);
     let padded = whole + &" ".repeat(16 * 1024);

@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeStatus, Role, encode};
+use ecod_testkit::until_async as until;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use serde_json::Value;
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
-use crate::cell::{Vehicles, config, join, start, until};
+use crate::cell::{Vehicles, config, join, start};
 use crate::http::{Events, get, try_request};
 use crate::processes::{self, Place, free_places};
 
@@ -83,7 +84,7 @@ async fn dead_brokers_clients_are_removed() {
     let mut edge = processes::start("edge", Role::Edge, places[0], &places, directory.path());
     let _cav = processes::start("euclid", Role::Cav, places[1], &places, directory.path());
     let mut plain = JoinSet::new();
-    plain.spawn(say_there_is("plain", places[0].broker));
+    plain.spawn(publish_status("plain", places[0].broker));
     let are_alive = |names: [&'static str; 2], wanted: bool| async move {
         let asked = try_request(
             places[1].page,
@@ -113,7 +114,7 @@ async fn dead_brokers_clients_are_removed() {
 }
 
 /// A client that does not gossip leaves its status with a broker.
-async fn say_there_is(name: &'static str, broker: SocketAddr) {
+async fn publish_status(name: &'static str, broker: SocketAddr) {
     let name = NodeName::from_static(name);
     let status = NodeStatus::starting(name.clone(), Uuid::from_u128(1), Role::Cav, "0.1.0");
     let options = MqttOptions::new(name.as_str(), broker.ip().to_string(), broker.port());

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use ecod::wire::Role;
 use ecod_actors::observe::recorder::RecordConfig;
+use ecod_testkit::until_async as until;
 
 use crate::cell::{self, Vehicles, config};
 use crate::processes::{Place, free_places, start};
@@ -159,12 +160,12 @@ async fn report_shows_map_at_cursor() {
         let picture = crate::http::get(at_euclid, "/api/picture").await.json();
         picture["leadership"]["leader"] == name && picture["map"].is_object()
     };
-    cell::until("the edge leads", || leads("edge")).await;
+    until("the edge leads", || leads("edge")).await;
     tokio::time::sleep(Duration::from_secs(3)).await;
     let vehicles = Vehicles::start(&[places[0].broker, euclid.broker_address().unwrap()], 4, 12);
     tokio::time::sleep(Duration::from_secs(5)).await;
     edge.0.kill().unwrap();
-    cell::until("euclid leads", || leads("euclid")).await;
+    until("euclid leads", || leads("euclid")).await;
     tokio::time::sleep(Duration::from_secs(3)).await;
     drop(vehicles);
     euclid.stop().await;

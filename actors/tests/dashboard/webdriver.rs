@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
+use ecod_testkit::{PATIENCE, until_async as until};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
 
-use crate::cell::{PATIENCE, until};
 use crate::http::request;
 use crate::processes::{Process, free_places};
 

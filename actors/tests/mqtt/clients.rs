@@ -3,7 +3,7 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,7 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
-use ecod_testkit::node_config;
+use ecod_testkit::{all_output, node_config};
 
 /// An edge of the cell that the documentation uses.
 async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
@@ -39,10 +39,6 @@ async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
 }
 
 /// True if a program is there that the test needs.
@@ -114,14 +110,14 @@ async fn documented_mosquitto_commands_work() {
     });
     let output = output.await.unwrap();
     node.stop().await;
-    let said = said(&output);
-    assert!(output.status.success(), "{said}");
-    let messages: Vec<serde_json::Value> = said
+    let text = all_output(&output);
+    assert!(output.status.success(), "{text}");
+    let messages: Vec<serde_json::Value> = text
         .lines()
         .map(|line| serde_json::from_str(line).unwrap())
         .collect();
     let [map, verdicts] = &*messages else {
-        panic!("{said}")
+        panic!("{text}")
     };
     assert_eq!(
         (&map["landmarks"][0]["id"], &map["landmarks"][0]["label"]),
@@ -168,7 +164,7 @@ async fn documented_mosquitto_commands_work_with_certificate() {
     });
     let output = output.await.unwrap();
     node.stop().await;
-    let map: serde_json::Value =
-        serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", said(&output)));
+    let map: serde_json::Value = serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|_| panic!("{}", all_output(&output)));
     assert_eq!(map["aggregator"], "edge");
 }

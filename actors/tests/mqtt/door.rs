@@ -354,12 +354,12 @@ async fn refused_program_is_logged_once() {
         assert_eq!(program.ask(topic, b"{}".to_vec()).await.0, "NotAuthorized");
     }
     let log = node.log();
-    let told: Vec<_> = log
+    let refusals: Vec<_> = log
         .lines()
         .filter(|line| line.contains("WARN") && line.contains("mallory"))
         .collect();
     assert!(
-        matches!(told[..], [line] if line.contains("not_permitted")),
+        matches!(refusals[..], [line] if line.contains("not_permitted")),
         "{log}"
     );
 }

@@ -15,8 +15,9 @@ use std::time::Duration;
 use ecod::model::quadkey::Quadkey;
 use ecod::wire::NodeState;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 
-use cell::{ORIGIN, config, start, until};
+use cell::{ORIGIN, config, start};
 use region::{Broker, Subscriber, assert_in_order};
 
 /// A subscriber gets two maps a second, and at any time later the leader's status and the cell's description.

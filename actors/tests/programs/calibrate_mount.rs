@@ -8,7 +8,7 @@ use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::view::PosedCamera;
 use ecod_actors::camera::image_codec::encode_jpeg;
-use ecod_testkit::walking_people;
+use ecod_testkit::{stderr, walking_people};
 use opencv::core::{CV_8UC1, Mat, Scalar};
 
 const NODE: &str = "# A camera on a mast.\nname = \"mast\"\n[pose]\nx_m = 10\ny_m = -5\nheading_deg = 90\n\
@@ -51,10 +51,6 @@ fn calibrate(directory: &Path, arguments: &[&str]) -> Output {
         "node.toml",
     ]);
     command.args(&arguments[1..]).output().unwrap()
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// The values of `camera.mount` that were printed.
@@ -114,19 +110,19 @@ fn points_update_mount_in_file() {
         &["points", "--in-map", "--write", "points.csv"],
     );
     is_near(printed(&output), [0.05, 0.05, 0.2, 0.05, 0.2, 0.2]);
-    let told = stderr(&output);
-    let outliers: Vec<_> = told
+    let output_text = stderr(&output);
+    let outliers: Vec<_> = output_text
         .lines()
         .filter(|line| line.contains("OUTLIER"))
         .collect();
     assert_eq!(
-        (outliers.len(), told.matches(" px, ").count()),
+        (outliers.len(), output_text.matches(" px, ").count()),
         (1, 6),
-        "{told}"
+        "{output_text}"
     );
     assert!(
-        told.contains("the middle of the image shows the ground from "),
-        "{told}"
+        output_text.contains("the middle of the image shows the ground from "),
+        "{output_text}"
     );
     let written = std::fs::read_to_string(directory.path().join("node.toml")).unwrap();
     assert!(

@@ -5,15 +5,9 @@ use std::process::{Command, Output, Stdio};
 
 use ecod::model::names::NodeName;
 use ecod_actors::platform::state_file::StateFile;
-use ecod_testkit::command;
+use ecod_testkit::stderr;
 
-fn ecod_node() -> Command {
-    command(env!("CARGO_BIN_EXE_ecod-node"))
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
+use crate::ecod_node;
 
 /// The printed configuration of a node whose environment is as given.
 fn printed(environment: &[(&str, &str)]) -> Output {

@@ -3,17 +3,14 @@
 use std::collections::BTreeMap;
 #[cfg(feature = "camera")]
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use ecod::wire::Role;
 use ecod_actors::node::config::NodeConfig;
-
-fn example(name: &str) -> PathBuf {
-    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/node")).join(name)
-}
+use ecod_testkit::example;
 
 fn load(name: &str) -> NodeConfig {
-    let file = example(name);
+    let file = example(&format!("node/{name}"));
     NodeConfig::load(Some(&file), &BTreeMap::<(), ()>::new())
         .unwrap_or_else(|error| panic!("{}: {error}", file.display()))
 }
@@ -53,7 +50,7 @@ fn example_vehicles_fit_example_edge() {
         assert_eq!(vehicle.role, role);
         assert_eq!(vehicle.cell, edge.cell);
         assert_eq!(vehicle.membership, edge.membership);
-        let description = std::fs::read_to_string(example("cell.toml")).unwrap();
+        let description = std::fs::read_to_string(example("node/cell.toml")).unwrap();
         let described = vehicle.described(&description).unwrap();
         let edge = edge.described(&description).unwrap();
         assert_eq!(
@@ -109,7 +106,7 @@ fn example_sets_only_common_keys() {
         .flat_map(|(keys, _)| keys.trim_end_matches('`').split("`, `"))
         .collect();
     explained.sort_unstable();
-    let text = std::fs::read_to_string(example("auto.toml")).unwrap();
+    let text = std::fs::read_to_string(example("node/auto.toml")).unwrap();
     let mut set = leaves(&text.parse().unwrap(), "");
     set.sort_unstable();
     assert_eq!(
@@ -166,7 +163,7 @@ fn documented_configurations_are_valid() {
 #[test]
 fn the_documentation_names_every_key() {
     let manual = page("docs/configuration.md") + &page("docs/cameras.md");
-    let description = std::fs::read_to_string(example("cell.toml")).unwrap();
+    let description = std::fs::read_to_string(example("node/cell.toml")).unwrap();
     let config = toml::to_string(&load("cav.toml").described(&description).unwrap()).unwrap();
     let keys = config
         .lines()

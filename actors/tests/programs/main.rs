@@ -21,3 +21,12 @@ mod status;
 mod try_pictures;
 #[cfg(feature = "camera")]
 mod video_sources;
+
+use std::process::Command;
+
+use ecod_testkit::command;
+
+/// The program without input, and without variables of the environment that configure it.
+fn ecod_node() -> Command {
+    command(env!("CARGO_BIN_EXE_ecod-node"))
+}

@@ -5,12 +5,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use ecod_testkit::{example, stderr};
 use serde_json::Value;
 use tempfile::TempDir;
-
-fn example(name: &str) -> PathBuf {
-    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples")).join(name)
-}
 
 fn ecod(arguments: &[&str]) -> Output {
     ecod_with_input(arguments, b"")
@@ -32,10 +29,6 @@ fn ecod_with_input(arguments: &[&str], input: &[u8]) -> Output {
     output
 }
 
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
 fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
@@ -55,11 +48,11 @@ fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
         text(&output),
     ];
     let run = ecod(&arguments);
-    assert!(run.status.success(), "{}", said(&run));
+    assert!(run.status.success(), "{}", stderr(&run));
     assert!(
-        said(&run).starts_with("96 lines, 96 used, "),
+        stderr(&run).starts_with("96 lines, 96 used, "),
         "{}",
-        said(&run)
+        stderr(&run)
     );
     output
 }
@@ -111,19 +104,19 @@ fn unusable_lines_count_by_reason() {
             &input,
         );
         assert_eq!(run.status.code(), Some(code));
-        let said = said(&run);
+        let error = stderr(&run);
         for part in [
             "6 lines, 1 used, 1 written",
             "rejected malformed 3\n  line 3: is no JSON object\n  line 4: is no JSON object\n  line 7: ",
             "rejected too_large 1\n  line 5: is longer than",
             "rejected out_of_order 1\n  line 6: captured_at_us: is not later than in an earlier line of this node",
         ] {
-            assert!(said.contains(part), "{said}");
+            assert!(error.contains(part), "{error}");
         }
         assert_eq!(
-            said.contains("5 of 6 reports were rejected, more than 82 % (--max-rejected)"),
+            error.contains("5 of 6 reports were rejected, more than 82 % (--max-rejected)"),
             code == 3,
-            "{said}"
+            "{error}"
         );
         assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
     }
@@ -148,17 +141,17 @@ fn named_votes_need_no_positions() {
     };
     let votes = run("vote_detections");
     assert!(
-        votes.status.success() && said(&votes).contains("1 lines, 1 used"),
+        votes.status.success() && stderr(&votes).contains("1 lines, 1 used"),
         "{}",
-        said(&votes)
+        stderr(&votes)
     );
     assert!(String::from_utf8_lossy(&votes.stdout).contains(r#""landmark":"table","label":"cup""#));
     let detections = run("detections");
     assert_eq!(detections.status.code(), Some(3));
     assert!(
-        said(&detections).contains("line 1: objects[0]: missing field `x_m`"),
+        stderr(&detections).contains("line 1: objects[0]: missing field `x_m`"),
         "{}",
-        said(&detections)
+        stderr(&detections)
     );
 }
 
@@ -204,12 +197,12 @@ fn reports_without_effect_fail() {
             run.status.code(),
             Some(if problem.is_some() { 3 } else { 0 }),
             "{report}: {}",
-            said(&run)
+            stderr(&run)
         );
         assert!(
-            problem.is_none_or(|problem| said(&run).contains(problem)),
+            problem.is_none_or(|problem| stderr(&run).contains(problem)),
             "{report}: {}",
-            said(&run)
+            stderr(&run)
         );
     }
 }
@@ -234,12 +227,12 @@ fn input_without_recording_fails() {
         assert!(
             run.status.code() == Some(3) && run.stdout.is_empty(),
             "{}",
-            said(&run)
+            stderr(&run)
         );
         assert!(
-            said(&run).contains("no report could be used"),
+            stderr(&run).contains("no report could be used"),
             "{}",
-            said(&run)
+            stderr(&run)
         );
     }
 }
@@ -253,7 +246,7 @@ fn foreign_time_units_are_reported() {
                 "{{\"schema\":1,\"node\":\"a\",\"seq\":1,\"captured_at_us\":{at},\"objects\":[]}}\n"
             )
         });
-        said(&ecod_with_input(
+        stderr(&ecod_with_input(
             &["replay", "--input", "-", "--output", "-"],
             lines.collect::<String>().as_bytes(),
         ))
@@ -280,9 +273,9 @@ fn passes_write_one_verdict_set() {
         "4",
     ]);
     assert!(
-        run.status.success() && said(&run).contains("rejected not_fused 48"),
+        run.status.success() && stderr(&run).contains("rejected not_fused 48"),
         "{}",
-        said(&run)
+        stderr(&run)
     );
     let lines: Vec<Value> = run
         .stdout
@@ -376,9 +369,13 @@ fn impossible_request_changes_no_file() {
             run.status.code(),
             Some(code),
             "{arguments:?}: {}",
-            said(&run)
+            stderr(&run)
         );
-        assert!(said(&run).contains(part), "{arguments:?}: {}", said(&run));
+        assert!(
+            stderr(&run).contains(part),
+            "{arguments:?}: {}",
+            stderr(&run)
+        );
     }
     assert_eq!(fs::read_to_string(recording).unwrap(), "{}\n");
     assert!(!Path::new(out).exists());

@@ -67,15 +67,15 @@ impl Service {
     /// All notifications of the node up to this one.
     fn receives_from(&self, wanted: &str) -> Vec<String> {
         let deadline = Instant::now() + PATIENCE;
-        let mut heard = Vec::new();
+        let mut lines_read = Vec::new();
         while let Some(line) = self.receive(deadline) {
             let found = line.starts_with(wanted);
-            heard.push(line);
+            lines_read.push(line);
             if found {
-                return heard;
+                return lines_read;
             }
         }
-        panic!("never: {wanted}, but {heard:?}");
+        panic!("never: {wanted}, but {lines_read:?}");
     }
 
     fn signal(&self, signal: Signal) {

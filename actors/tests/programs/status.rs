@@ -7,11 +7,13 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use ecod_testkit::{PATIENCE, command};
+use ecod_testkit::PATIENCE;
 use tempfile::TempDir;
 
-fn ecod_node(directory: &Path) -> Command {
-    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
+use crate::ecod_node;
+
+fn ecod_node_in(directory: &Path) -> Command {
+    let mut command = ecod_node();
     command.current_dir(directory);
     command
 }
@@ -53,7 +55,7 @@ fn machine(role: &str) -> (TempDir, SocketAddr) {
 
 /// Starts the node of a machine and waits for its page.
 fn start(directory: &Path) -> Process {
-    let mut node = ecod_node(directory);
+    let mut node = ecod_node_in(directory);
     node.args(["--config", "ecod/node.toml"])
         .stderr(Stdio::piped());
     let mut node = node.spawn().unwrap();
@@ -70,7 +72,7 @@ fn has_installed_node() -> bool {
 }
 
 fn status(directory: &Path, arguments: &[&str]) -> Output {
-    let mut status = ecod_node(directory);
+    let mut status = ecod_node_in(directory);
     status.arg("status").args(arguments).output().unwrap()
 }
 
@@ -125,7 +127,7 @@ fn status_exit_code_shows_readiness() {
             && json["nodes"][0]["alive"] == true,
         "{json}"
     );
-    let shown = ecod_node(directory.path())
+    let shown = ecod_node_in(directory.path())
         .args(["cell", "show"])
         .output()
         .unwrap();
@@ -134,7 +136,7 @@ fn status_exit_code_shows_readiness() {
         "at the port that the node has taken: {}",
         text(&shown.stderr)
     );
-    let mut watching = ecod_node(directory.path());
+    let mut watching = ecod_node_in(directory.path());
     let watching = watching
         .args(["status", "--watch", "--json"])
         .stdout(Stdio::piped());
@@ -165,7 +167,10 @@ fn doctor_recognises_running_node() {
     let (directory, page) = machine("edge");
     let _node = start(directory.path());
     until_status(directory.path(), &[], 0);
-    let output = ecod_node(directory.path()).arg("doctor").output().unwrap();
+    let output = ecod_node_in(directory.path())
+        .arg("doctor")
+        .output()
+        .unwrap();
     let shown = text(&output.stdout);
     let said = text(&output.stderr);
     assert!(output.status.success(), "{shown}{said}");
@@ -189,7 +194,7 @@ fn commands_use_local_node_files() {
     }
     let (directory, _) = machine("edge");
     let run = |arguments: &[&str]| {
-        let output = ecod_node(directory.path())
+        let output = ecod_node_in(directory.path())
             .args(arguments)
             .output()
             .unwrap();
@@ -201,7 +206,7 @@ fn commands_use_local_node_files() {
     assert!(text(&reset.stdout).contains("daily.ada.term.json"));
     let shown = run(&["cell", "show"]);
     assert!(text(&shown.stderr).contains("no node at 127.0.0.1:"));
-    let made = ecod_node(directory.path())
+    let made = ecod_node_in(directory.path())
         .args(["pki", "init", "--cell", "daily", "--dir", "ecod/pki"])
         .output()
         .unwrap();
@@ -209,7 +214,7 @@ fn commands_use_local_node_files() {
     let issued = run(&["pki", "issue", "viewer"]);
     assert!(text(&issued.stdout).contains("ecod/pki/nodes/viewer.pem"));
     let elsewhere = tempfile::tempdir().unwrap();
-    let without = ecod_node(elsewhere.path())
+    let without = ecod_node_in(elsewhere.path())
         .args(["reset", "--term"])
         .output()
         .unwrap();
@@ -222,7 +227,7 @@ fn commands_use_local_node_files() {
 #[test]
 fn log_begins_with_page() {
     let (directory, page) = machine("edge");
-    let mut node = ecod_node(directory.path());
+    let mut node = ecod_node_in(directory.path());
     node.args(["--config", "ecod/node.toml", "--log-format", "text"])
         .stderr(Stdio::piped());
     let mut node = Process(node.spawn().unwrap());
@@ -278,7 +283,7 @@ fn busy_default_port_is_replaced() {
         without.replace("[dashboard]\n", "[dashboard]\nenabled = false\n"),
     )
     .unwrap();
-    let mut node = ecod_node(directory.path());
+    let mut node = ecod_node_in(directory.path());
     node.args(["--config", "ecod/node.toml", "--log-format", "json"])
         .stderr(Stdio::piped());
     let mut node = Process(node.spawn().unwrap());
@@ -295,7 +300,7 @@ fn busy_default_port_is_replaced() {
     let serves = log.find(|line| line.contains("broker serves")).unwrap();
     assert!(!serves.contains(":1883"), "{serves}");
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
-    let refused = ecod_node(directory.path())
+    let refused = ecod_node_in(directory.path())
         .args(["--role", "edge", "--no-dashboard", "--listen"])
         .arg(taken.local_addr().unwrap().to_string())
         .env("RUST_LOG", "off")

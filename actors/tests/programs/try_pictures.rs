@@ -4,24 +4,19 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use ecod_actors::camera::image_codec;
-use ecod_testkit::command;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use opencv::core::{BORDER_CONSTANT, Mat, Scalar, copy_make_border};
 use serde_json::Value;
 
+use crate::ecod_node;
+
 /// Maximum time for anything.
 const PATIENCE: Duration = Duration::from_secs(120);
-
-fn ecod_node() -> Command {
-    let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
-    command.env_remove("RUST_LOG");
-    command
-}
 
 /// A directory with this photograph as its only image, in a frame, so that its objects are not cut.
 fn album(directory: &Path, photograph: &str) -> String {
@@ -53,9 +48,9 @@ fn album(directory: &Path, photograph: &str) -> String {
 }
 
 /// A running program, killed when dropped.
-struct Trial(Child);
+struct TryProgram(Child);
 
-impl Drop for Trial {
+impl Drop for TryProgram {
     fn drop(&mut self) {
         self.0.kill().ok();
         self.0.wait().unwrap();
@@ -141,8 +136,8 @@ fn two_cameras_make_one_map() {
         .args(["--dashboard", "127.0.0.1:0"])
         .arg("--save")
         .arg(&saved);
-    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
+    let mut program = TryProgram(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(program.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
     let page = address(&mut lines, "page");
@@ -160,14 +155,15 @@ fn two_cameras_make_one_map() {
         std::thread::sleep(Duration::from_millis(200));
         found = objects(&page).unwrap_or(found);
     }
-    let told = |line: &String| line.contains("frames/s") && line.contains("objects on the map");
+    let shows_progress =
+        |line: &String| line.contains("frames/s") && line.contains("objects on the map");
     let next_line = || {
         progress
             .recv_timeout(deadline.saturating_duration_since(Instant::now()))
             .ok()
     };
     assert!(
-        std::iter::from_fn(next_line).any(|line| told(&line)),
+        std::iter::from_fn(next_line).any(|line| shows_progress(&line)),
         "progress is printed"
     );
     for page in [&page, &second] {
@@ -188,8 +184,8 @@ fn two_cameras_make_one_map() {
         "before the other camera, 50 m away: {found:?}"
     );
 
-    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
-    assert!(trial.0.wait().unwrap().success());
+    kill(Pid::from_raw(program.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(program.0.wait().unwrap().success());
 
     for (name, images) in [("node.toml", &albums[0]), ("node-2.toml", &albums[1])] {
         let path = directory.path().join(name);
@@ -229,8 +225,8 @@ fn missing_source_shows_simulated_street() {
     command
         .args(["try", "--dashboard", "127.0.0.1:0"])
         .current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
-    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
-    let mut lines = BufReader::new(trial.0.stderr.take().unwrap())
+    let mut program = TryProgram(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(program.0.stderr.take().unwrap())
         .lines()
         .map_while(Result::ok);
     let page = address(&mut lines, "page");
@@ -267,8 +263,8 @@ fn missing_source_shows_simulated_street() {
     };
     let objects = map(&page).unwrap();
     assert!(!objects.iter().any(near_mast), "{objects:?}");
-    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
-    assert!(trial.0.wait().unwrap().success());
+    kill(Pid::from_raw(program.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(program.0.wait().unwrap().success());
 }
 
 #[test]

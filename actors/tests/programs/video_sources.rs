@@ -14,14 +14,12 @@ use ecod_actors::camera::frame_source::capture::{Capture, CaptureConfig, Capture
 use ecod_actors::camera::frame_source::{FrameError, FrameSource, SourceConfig};
 use ecod_actors::camera::image_codec::encode_jpeg;
 use ecod_actors::platform::clock;
+use ecod_testkit::{PATIENCE, until_blocking as until};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use opencv::core::{CV_8UC3, Mat, Scalar, Size, Vec3b};
 use opencv::prelude::*;
 use opencv::videoio::VideoWriter;
-
-/// Maximum time for anything.
-const PATIENCE: Duration = Duration::from_secs(60);
 
 fn gray(value: u8) -> Mat {
     Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(f64::from(value))).unwrap()
@@ -404,14 +402,6 @@ fn video_programs(parent: u32) -> BTreeSet<u32> {
 fn is_running(id: u32) -> bool {
     let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap_or_default();
     status.contains("Name:\tecod-video") && !status.contains("State:\tZ")
-}
-
-fn until(what: &str, holds: impl Fn() -> bool) {
-    let end = Instant::now() + PATIENCE;
-    while !holds() {
-        assert!(Instant::now() < end, "never: {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
 }
 
 fn signal(id: u32, signal: Signal) {

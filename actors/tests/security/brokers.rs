@@ -68,7 +68,7 @@ async fn vehicle_leaves_only_revoked_broker() {
             }
         }),
         seed: 4,
-        looks_on: false,
+        only_observes: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await.unwrap();
     gateway

@@ -27,7 +27,7 @@ async fn client_without_certificate_is_refused() {
     let mut answer = Vec::new();
     timeout(SOON, plain.read_to_end(&mut answer))
         .await
-        .expect("left waiting")
+        .expect("the connection stays open without an answer")
         .ok();
     assert_ne!(answer.first(), Some(&0x20), "no CONNACK");
 
@@ -41,7 +41,7 @@ async fn client_without_certificate_is_refused() {
         stream.write_all(&LOGIN_PACKET).await.ok();
         let read = timeout(SOON, stream.read(&mut [0; 16]))
             .await
-            .expect("left waiting");
+            .expect("the connection stays open without an answer");
         assert!(!matches!(read, Ok(1..)), "{read:?}");
     }
     cell.counted(Event::ClientUntrusted, 2).await;

@@ -23,7 +23,9 @@ use crate::fixture::{
 async fn closed(stream: &mut (impl AsyncReadExt + Unpin)) {
     let mut buffer = [0; 1024];
     let ended = async { while matches!(stream.read(&mut buffer).await, Ok(1..)) {} };
-    timeout(SOON, ended).await.expect("left open");
+    timeout(SOON, ended)
+        .await
+        .expect("the connection stays open");
 }
 
 #[tokio::test]

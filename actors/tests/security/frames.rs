@@ -57,7 +57,7 @@ async fn repeated_frame_is_accepted_once() {
     let edge = start("edge", None).await;
     let repeating = tokio::spawn(repeat(edge.address, relay));
     let euclid = start("euclid", Some(between)).await;
-    until("they meet", || {
+    until("both nodes are members", || {
         !edge.members.borrow().is_empty() && !euclid.members.borrow().is_empty()
     })
     .await;

@@ -57,7 +57,7 @@ async fn nodes_join_only_with_certificates() {
     };
     let strange = start("zeno", Some(&strange), Some(edge.address)).await;
     let euclid = start("euclid", Some(&euclid), Some(edge.address)).await;
-    until("they meet", || {
+    until("both nodes are members", || {
         seen_by(&edge).len() == 1 && seen_by(&euclid).len() == 1
     })
     .await;
@@ -85,7 +85,7 @@ async fn revoked_node_goes_down_soon() {
     let euclid = pki.issue("euclid", Role::Auto, DAY);
     let edge = start("edge", Some(&edge), None).await;
     let euclid = start("euclid", Some(&euclid), Some(edge.address)).await;
-    until("they meet", || {
+    until("both nodes are members", || {
         seen_by(&edge).len() == 1 && seen_by(&euclid).len() == 1
     })
     .await;

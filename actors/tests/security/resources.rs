@@ -265,7 +265,7 @@ async fn absent_readers_have_no_queue() {
         assert_eq!(
             subscribe(&mut gauss, "ecod/v1/lot/detections/v01", 1).await,
             0,
-            "another quality than asked for"
+            "another quality than requested"
         );
         gauss.shutdown().await.unwrap();
         drop(gauss);
@@ -329,11 +329,9 @@ async fn large_maps_reach_all_readers() {
     const MAPS: usize = 20;
     let adjust = |config: &mut BrokerConfig| {
         config.max_packet_bytes = None;
-        (
-            config.connect_burst,
-            config.handshake_timeout_ms,
-            config.max_clients_each,
-        ) = (1000, 10_000, 64);
+        config.connect_burst = 1000;
+        config.handshake_timeout_ms = 10_000;
+        config.max_clients_each = 64;
     };
     let mut cell = Cell::start_with(adjust).await;
     let mut readers = JoinSet::new();

@@ -35,7 +35,9 @@ async fn log_in(cell: &mut Cell, id: &str) -> (WebSocketStream<TlsStream<TcpStre
         ))
         .await
         .unwrap();
-    let answer = timeout(SOON, socket.next()).await.expect("left waiting");
+    let answer = timeout(SOON, socket.next())
+        .await
+        .expect("the connection stays open without an answer");
     let answer = answer
         .and_then(Result::ok)
         .map(|message| message.into_data().to_vec());

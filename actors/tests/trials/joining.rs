@@ -6,17 +6,14 @@ use std::fs::{self, File};
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::Authority;
-use ecod_testkit::{command, free_gossip_address};
-
-/// Maximum time for anything.
-const PATIENCE: Duration = Duration::from_secs(60);
+use ecod_testkit::{all_output, command, free_gossip_address, until_blocking as until};
 
 fn ecod_node(arguments: &[&str]) -> Command {
     let mut command = command(env!("CARGO_BIN_EXE_ecod-node"));
@@ -24,20 +21,24 @@ fn ecod_node(arguments: &[&str]) -> Command {
     command
 }
 
-pub(crate) fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
-}
-
 fn succeeds(arguments: &[&str]) -> String {
     let output = ecod_node(arguments).output().unwrap();
-    assert!(output.status.success(), "{arguments:?}: {}", said(&output));
-    said(&output)
+    assert!(
+        output.status.success(),
+        "{arguments:?}: {}",
+        all_output(&output)
+    );
+    all_output(&output)
 }
 
 fn fails(arguments: &[&str]) -> String {
     let output = ecod_node(arguments).output().unwrap();
-    assert!(!output.status.success(), "{arguments:?}: {}", said(&output));
-    said(&output)
+    assert!(
+        !output.status.success(),
+        "{arguments:?}: {}",
+        all_output(&output)
+    );
+    all_output(&output)
 }
 
 /// A process that ends with the test.
@@ -112,14 +113,6 @@ pub(crate) fn tokens(host: &mut Running, count: usize) -> Vec<String> {
     tokens.take(count).collect()
 }
 
-pub(crate) fn until(what: &str, holds: impl Fn() -> bool) {
-    let deadline = Instant::now() + PATIENCE;
-    while !holds() {
-        assert!(Instant::now() < deadline, "never: {what}");
-        std::thread::sleep(Duration::from_millis(50));
-    }
-}
-
 #[test]
 fn three_machines_form_cell() {
     let machines = ["edge", "gauss", "euclid"].map(|_| tempfile::tempdir().unwrap());
@@ -128,12 +121,12 @@ fn three_machines_form_cell() {
         .map(|machine| machine.path().to_str().unwrap());
     let gossip = free_gossip_address().to_string();
 
-    let said = succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
+    let output = succeeds(&["init", "lot-1", "edge", "--role", "edge", "--dir", edge]);
     assert!(
-        said.contains("ecod-node invite NAME --dir")
-            && said.contains("ecod-node cell set --config")
-            && said.contains("start it: ecod-node --config"),
-        "{said}"
+        output.contains("ecod-node invite NAME --dir")
+            && output.contains("ecod-node cell set --config")
+            && output.contains("start it: ecod-node --config"),
+        "{output}"
     );
     let mut nodes = vec![run(Path::new(edge), &gossip)];
     let (mut host, tokens) = invite(edge, &gossip, &["gauss", "euclid"]);
@@ -316,14 +309,17 @@ fn one_command_restores_expired_node() {
     let config_path = machines[0].path().join("node.toml");
     let config = config_path.to_str().unwrap();
     let directory = pki.to_str().unwrap();
-    let said = succeeds(&["pki", "renew", "--config", config, "--dir", directory]);
-    assert!(said.contains("renewed the certificate of edge"), "{said}");
+    let output = succeeds(&["pki", "renew", "--config", config, "--dir", directory]);
+    assert!(
+        output.contains("renewed the certificate of edge"),
+        "{output}"
+    );
     let (_host, tokens) = invite(edge, &gossip, &["gauss"]);
     let configuration = fs::read(machines[1].path().join("node.toml")).unwrap();
-    let said = succeeds(&["join", &tokens[0], "--dir", gauss]);
+    let output = succeeds(&["join", &tokens[0], "--dir", gauss]);
     assert!(
-        said.contains("gauss has a new certificate of the cell lot-1"),
-        "{said}"
+        output.contains("gauss has a new certificate of the cell lot-1"),
+        "{output}"
     );
     assert_eq!(
         fs::read(machines[1].path().join("node.toml")).unwrap(),

@@ -259,7 +259,7 @@ fn certified_program_serves_one_node() {
     agreed(&vehicle.unwrap(), "euclid");
     assert!(
         connect(&cav, "euclid", Some(&cav_tls)).is_ok(),
-        "the door of a node that never leads"
+        "the door of a node that may not lead"
     );
     let (certificate, key) = cav_tls.identity.clone().unwrap();
     let at = [
@@ -440,7 +440,10 @@ fn refusal_reaches_program() {
         matches!(&refused, Error::Refused(text) if text.contains("detections/gauss--rust")),
         "{refused}"
     );
-    assert!(cell.report(frame()).is_ok(), "each refusal is told once");
+    assert!(
+        cell.report(frame()).is_ok(),
+        "each refusal is reported once"
+    );
 }
 
 /// A broker that accepts any message, and a client that sends arbitrary messages.
@@ -550,7 +553,7 @@ fn lost_broker_is_reconnected() {
     });
     assert!(
         maps.next().unwrap().is_ok(),
-        "the broker was asked for maps again"
+        "the client subscribed to maps again"
     );
 }
 

@@ -142,7 +142,7 @@ mod tests {
         assert_eq!(
             places.enter(12, &EVIL, later),
             Ok(()),
-            "silent ones give way"
+            "silent stations are evicted"
         );
     }
 

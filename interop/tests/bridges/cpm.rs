@@ -265,7 +265,7 @@ fn cpm_and_map_cross_bridge() {
     assert_eq!(
         labels(&map),
         ["car"],
-        "the bus is another station's, and known from it alone"
+        "only another station reports the bus"
     );
     assert_eq!(labels(&vehicle), ["car"], "a vacancy sign is no object");
     assert!((vehicle.objects[0].x_m - 4.0).abs() < 0.01, "{vehicle:?}");

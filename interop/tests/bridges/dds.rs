@@ -16,7 +16,7 @@ use tokio::runtime::Runtime;
 
 /// Runs a bridge beside an edge to which a vehicle reports. It ends once Python has published such detections, and found an
 /// object of this label at this place of the map.
-fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
+fn exchange(kind: &str, ros: RosSettings, label: &str, place_m: [f64; 2]) {
     let python = std::env::var("DDS_PYTHON").unwrap();
     let config = node_config("edge", "lot-1", Role::Edge);
     let runtime = Runtime::new().unwrap();
@@ -52,7 +52,7 @@ fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
             }
         });
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/check-dds.py");
-        let place = [x_m, y_m].map(|metres| metres.to_string());
+        let place = place_m.map(|metres| metres.to_string());
         let run = Command::new(python)
             .arg(script)
             .args([kind, label])
@@ -115,7 +115,8 @@ fn map_frame_detections_become_objects() {
             input: Some(input),
             ..RosSettings::default()
         },
-        ("truck", 12.0, -5.0),
+        "truck",
+        [12.0, -5.0],
     );
 }
 
@@ -128,7 +129,7 @@ fn camera_detections_use_pose() {
         camera: camera(),
         ..RosSettings::default()
     };
-    exchange("optical", ros, ("truck", 7.0, 11.0));
+    exchange("optical", ros, "truck", [7.0, 11.0]);
 }
 
 #[test]
@@ -145,7 +146,7 @@ fn moving_camera_detections_use_poses() {
         camera,
         ..RosSettings::default()
     };
-    exchange("driving", ros, ("truck", 7.0, 11.0));
+    exchange("driving", ros, "truck", [7.0, 11.0]);
 }
 
 #[test]
@@ -157,7 +158,7 @@ fn image_boxes_use_optics_and_ground() {
         camera: camera(),
         ..RosSettings::default()
     };
-    exchange("pictures", ros, ("post", 7.0, 11.0));
+    exchange("pictures", ros, "post", [7.0, 11.0]);
 }
 
 #[test]

@@ -240,7 +240,7 @@ fn invalid_log_leaves_no_output() {
     let first = std::fs::read(&output).unwrap();
     assert!(
         !first.is_empty() && run().0 == Some(2),
-        "another's file is left alone"
+        "the file of another program is kept"
     );
     assert_eq!(std::fs::read(&output).unwrap(), first);
 }

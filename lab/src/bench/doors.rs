@@ -203,7 +203,7 @@ async fn idle_memory(
             let mut node = NodeProcess::start(program, &config, directory)?;
             sleep(IDLE).await;
             node.check()?;
-            let usage = UsageMeter::start(node.pid().context("the vehicle ended")?).stop();
+            let usage = UsageMeter::start(node.pid().context("the vehicle ended")?).stop()?;
             resident.push(usage.resident_bytes as f64 / 1e6);
             node.stop().await;
         }

@@ -51,7 +51,7 @@ const LEAD_IN: Duration = Duration::from_millis(300);
 /// Connects the vehicles, sends the load and gathers the answers.
 ///
 /// # Errors
-/// Returns an error if the broker cannot be reached or no map comes.
+/// Returns an error if the broker cannot be reached, no map comes or the aggregator ends.
 pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure> {
     let load = Load {
         votes: load.votes && target.votes,
@@ -115,7 +115,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
     let meters =
         [target.aggregator, Some(std::process::id())].map(|pid| pid.map(UsageMeter::start));
     let sent = on_a_thread(schedule, load, target.clone(), senders).await?;
-    let [aggregator, own] = meters.map(|meter| meter.map(UsageMeter::stop));
+    let [aggregator, own] = meters.map(|meter| meter.map(UsageMeter::stop).transpose());
     let (cell, bare) = gather(&vehicles, schedule, load).await;
     let [map_bytes, verdict_bytes] = answer_bytes.all();
     Ok(BenchFigure {
@@ -126,8 +126,8 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
         verdict_bytes,
         refused: sent.refused,
         latest: sent.latest,
-        aggregator,
-        vehicles: own.unwrap_or_default(),
+        aggregator: aggregator?,
+        vehicles: own?.unwrap_or_default(),
     })
 }
 

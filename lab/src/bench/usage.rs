@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
+
 /// Processor time of one process between two moments.
 #[derive(Debug)]
 pub struct UsageMeter {
@@ -34,13 +36,14 @@ impl UsageMeter {
     }
 
     /// Usage until now; threads that ended in between are not counted.
-    pub fn stop(self) -> Usage {
+    ///
+    /// # Errors
+    /// Returns an error if the process has ended.
+    pub fn stop(self) -> anyhow::Result<Usage> {
         let span = self.begun.elapsed().as_secs_f64();
-        let [resident_bytes, anonymous_bytes] =
-            ["VmRSS:", "RssAnon:"].map(|key| memory_bytes(self.pid, key));
         let mut usage = Usage {
-            resident_bytes,
-            anonymous_bytes,
+            resident_bytes: memory_bytes(self.pid, "VmRSS:")?,
+            anonymous_bytes: memory_bytes(self.pid, "RssAnon:")?,
             ..Usage::default()
         };
         for (thread, (name, time)) in threads(self.pid) {
@@ -51,7 +54,7 @@ impl UsageMeter {
             let percent = 100.0 * time.saturating_sub(before).as_secs_f64() / span;
             *usage.threads.entry(name).or_default() += percent;
         }
-        usage
+        Ok(usage)
     }
 }
 
@@ -86,19 +89,21 @@ fn threads(pid: u32) -> BTreeMap<u32, (String, Duration)> {
     tasks.flatten().filter_map(thread).collect()
 }
 
-fn memory_bytes(pid: u32, key: &str) -> u64 {
-    let text = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+fn memory_bytes(pid: u32, key: &str) -> anyhow::Result<u64> {
+    let path = format!("/proc/{pid}/status");
+    let text = fs::read_to_string(&path).with_context(|| format!("cannot read {path}"))?;
+    // A process that has ended and was not waited for has no memory.
     let line = text
         .lines()
         .find_map(|line| line.strip_prefix(key))
-        .unwrap_or_default();
+        .with_context(|| format!("no {key} in {path}: the process has ended"))?;
     let kilobytes: u64 = line
         .trim()
         .trim_end_matches("kB")
         .trim_end()
         .parse()
-        .unwrap_or(0);
-    kilobytes * 1024
+        .with_context(|| format!("{key} in {path}"))?;
+    Ok(kilobytes * 1024)
 }
 
 #[cfg(test)]
@@ -115,11 +120,19 @@ mod tests {
             .unwrap();
         let meter = UsageMeter::start(std::process::id());
         std::thread::sleep(Duration::from_millis(200));
-        let usage = meter.stop();
+        let usage = meter.stop().unwrap();
         drop(stop);
         worker.join().unwrap();
         assert!(usage.percent_of("busy-bee") > 1.0, "{usage:?}");
         assert!(usage.percent() >= usage.percent_of("busy-bee"));
         assert!(usage.resident_bytes > 1_000_000);
+    }
+
+    #[test]
+    fn ended_process_has_no_usage() {
+        let mut ended = std::process::Command::new("true").spawn().unwrap();
+        let meter = UsageMeter::start(ended.id());
+        ended.wait().unwrap();
+        assert!(meter.stop().is_err());
     }
 }

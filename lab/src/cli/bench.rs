@@ -1,6 +1,7 @@
 //! `ecod-lab bench`: latency, capacity and costs of a live cell.
 
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -575,12 +576,16 @@ impl Figures {
     }
 }
 
-/// Replaces the section and keeps the others.
+/// Replaces the section and keeps the others. A file that is not understood is kept as it is.
 fn save(path: &Path, section: &str, figures: &Figures) -> anyhow::Result<()> {
-    let read = std::fs::read(path)
-        .ok()
-        .and_then(|bytes| serde_json::from_slice(&bytes).ok());
-    let mut sections: Map<String, Value> = read.unwrap_or_default();
+    let mut sections: Map<String, Value> = match std::fs::read(path) {
+        Ok(bytes) => serde_json::from_slice(&bytes)
+            .with_context(|| format!("{} has no sections of figures", path.display()))?,
+        Err(error) if error.kind() == ErrorKind::NotFound => Map::new(),
+        Err(error) => {
+            return Err(error).with_context(|| format!("cannot read {}", path.display()));
+        }
+    };
     sections.insert(section.into(), serde_json::to_value(figures)?);
     super::write_json(path, &sections)
 }
@@ -591,5 +596,24 @@ fn allow_many_connections() {
         .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
     if let Err(error) = raised {
         tracing::warn!(%error, "the limit of open files stays");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_sections_and_files_are_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("bench.json");
+        save(&path, "cell", &Figures::default()).unwrap();
+        save(&path, "costs", &Figures::default()).unwrap();
+        let sections: Map<String, Value> =
+            serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+        assert!(sections.keys().eq(["cell", "costs"]), "{sections:?}");
+        std::fs::write(&path, "no figures").unwrap();
+        assert!(save(&path, "cell", &Figures::default()).is_err());
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "no figures");
     }
 }

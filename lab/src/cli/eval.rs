@@ -178,7 +178,7 @@ fn evaluate(arguments: &EvalArguments, input: &Path) -> Result<Evaluated, Failur
         );
     }
     read_output(input, |line| evaluation.fused(&line))?;
-    if !evaluation.meets_truth() {
+    if !evaluation.matches_truth() {
         eprintln!(
             "no location of {} is in {} at the time of a line; locations count by their exact ids",
             input.display(),

@@ -100,7 +100,7 @@ mod tests {
             taken("edge", 3, 5, 400),
         ];
         let terms = judged_terms([&quick[..], &slow[..]], |maps| maps.len() as f64);
-        let told = |term: &JudgedTerm| {
+        let summary = |term: &JudgedTerm| {
             let from = term.from.micros() / 1000;
             let until = term.until.micros() / 1000;
             (
@@ -116,6 +116,6 @@ mod tests {
             ("euclid@2".to_owned(), 210, 320, Some(315), 2.0),
             ("edge@3".to_owned(), 400, 400, Some(80), 1.0),
         ];
-        assert_eq!(terms.iter().map(told).collect::<Vec<_>>(), expected);
+        assert_eq!(terms.iter().map(summary).collect::<Vec<_>>(), expected);
     }
 }

@@ -61,7 +61,7 @@ impl ReportCollector {
             counters: Arc::default(),
             subscriber: Arc::new(move |delivery| lock(&kept).add(delivery)),
             seed: 1,
-            looks_on: false,
+            only_observes: false,
         };
         let (gateway, ended) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers { addresses: brokers })?;

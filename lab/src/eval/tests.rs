@@ -87,7 +87,7 @@ fn figures_match_hand_calculation() {
     assert_eq!(
         vote.mean_recall_pct,
         Some(50.0),
-        "of nothing, cup and mouse"
+        "of no label, cup and mouse"
     );
     assert_eq!(
         vote.majority_accuracy_pct,
@@ -190,16 +190,16 @@ fn synonyms_apply_without_landmarks() {
     assert_eq!(
         pace.unwrap().majority_accuracy_pct,
         Some(0.0),
-        "PACE knows no synonyms"
+        "PACE has no synonyms"
     );
 }
 
 #[test]
 fn unmatched_landmarks_are_listed() {
     let truth = || Truth::parse(r#"{"landmarks": {"a": "cup"}}"#).unwrap();
-    for (id, meets) in [("a", true), ("A", false)] {
+    for (id, matches) in [("a", true), ("A", false)] {
         let mut evaluation = Evaluation::new(truth());
         evaluation.fused(&verdicts(1, &[(id, Some("cup"))]));
-        assert_eq!(evaluation.meets_truth(), meets, "{id}");
+        assert_eq!(evaluation.matches_truth(), matches, "{id}");
     }
 }

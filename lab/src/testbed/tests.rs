@@ -235,7 +235,7 @@ fn parked_vehicle_hides_objects_behind() {
     // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it
     // begins at (y - 1.375) / 8.
     assert!(!cover(1.6), "covers a quarter of the code");
-    assert!(cover(2.1), "passes beside");
+    assert!(cover(2.1), "does not cover the code");
     let camera = Pose::new(0.0, 0.0, 0.0);
     let testbed = read(&lot(&json!([spot(0, 15.0, 0.0, Some("A"))]))).unwrap();
     let [sign, plate] = testbed.cards(&testbed.scenes[0]).try_into().unwrap();

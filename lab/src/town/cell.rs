@@ -128,7 +128,7 @@ impl TownCell {
             Ok(()) => {
                 let objects: Arc<[_]> = self.neighbours.near(at).into();
                 self.aggregator.command(
-                    &Command::TakeNeighbours {
+                    &Command::OnNeighbours {
                         objects,
                         stated_at: at,
                     },

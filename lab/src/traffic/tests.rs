@@ -118,7 +118,10 @@ fn vehicles_move_stop_and_keep_distance() {
             .collect::<Vec<_>>()
     };
     let steps: Vec<f64> = tracks.values().flat_map(|track| step(track)).collect();
-    assert!(steps.iter().all(|step| *step < 1.6), "nobody jumps");
+    assert!(
+        steps.iter().all(|step| *step < 1.6),
+        "positions are continuous"
+    );
     let share = |of: &dyn Fn(&f64) -> bool| {
         steps.iter().filter(|step| of(step)).count() as f64 / steps.len() as f64
     };

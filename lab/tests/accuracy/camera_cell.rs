@@ -30,7 +30,7 @@ async fn plate_on_a_new_map(vehicle: &NodeHandle, plate: &str) {
     });
     timeout(PATIENCE, seen)
         .await
-        .expect("the plate never came back")
+        .expect("the plate did not come back")
         .expect("the follower lives on");
 }
 

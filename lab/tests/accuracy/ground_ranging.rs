@@ -139,12 +139,12 @@ impl Dice {
 }
 
 /// Errors of the places of posts with these boxes, relative to their range, and squared Mahalanobis distances.
-/// The node assumes the camera at `believed`; `noise_px` are errors of edges of a detector.
+/// The node assumes the camera at `assumed`; `noise_px` are errors of edges of a detector.
 fn errors(
     found: &[BoundingBox],
     places: &[Point2<f64>],
     projection: &Projection,
-    believed: &Pose,
+    assumed: &Pose,
     mut noise_px: impl FnMut() -> f64,
 ) -> Vec<(f64, f64)> {
     let pose = Pose::new(0.0, 0.0, HEADING_RAD);
@@ -168,7 +168,7 @@ fn errors(
         ] {
             *edge += noise_px();
         }
-        let placed = projection.place(&detection, cut, None, believed).ok()?;
+        let placed = projection.place(&detection, cut, None, assumed).ok()?;
         let position = Vector2::new(placed.x_m, placed.y_m);
         // Bearings identify the post.
         let bearing_rad = |at: &Point2<f64>| pose.range_bearing(at).1;
@@ -330,7 +330,7 @@ fn shares(
                 roll_rad: real.roll_rad + off(unknown.tilt_rad),
                 ..*real
             };
-            let believed = Pose::new(
+            let assumed = Pose::new(
                 off(position_sigma_m),
                 off(position_sigma_m),
                 HEADING_RAD + off(heading_sigma_rad),
@@ -343,7 +343,7 @@ fn shares(
                     unknown,
                 );
                 let projection = Projection::new(config, testbed.camera.intrinsics, stated);
-                let errors = errors(found, places, &projection, &believed, || {
+                let errors = errors(found, places, &projection, &assumed, || {
                     DETECTOR_SIGMA_PX * dice.normal()
                 });
                 all[index] += errors.len();

@@ -30,7 +30,7 @@ fn identity_survives_change_of_cell() {
     );
     assert!(
         alone_idf1 < whole - 4.0,
-        "without neighbours nothing is handed over: {alone_idf1} of {whole}"
+        "without neighbours no identity is handed over: {alone_idf1} of {whole}"
     );
     let [border, middle] =
         [&linked.cells.border, &linked.cells.middle].map(|part| part.at_best_f1.hota_pct.unwrap());

@@ -210,7 +210,7 @@ fn stated_velocities_headings_sizes_improve_maps() {
     );
     assert!(
         rich[1] < 0.5 * plain[1],
-        "{} and {} of the headings are not known",
+        "{} and {} of the headings are unknown",
         rich[1],
         plain[1]
     );

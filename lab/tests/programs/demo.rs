@@ -1,22 +1,17 @@
 //! `ecod-lab demo` and `ecod-lab testbed` as programs.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod_testkit::{stderr, until_blocking as until};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 fn ecod_lab() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-lab"));
     command.stdin(Stdio::null());
     command
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn scenes() -> PathBuf {
@@ -117,14 +112,6 @@ fn working_in(directory: &Path) -> Vec<i32> {
         .collect()
 }
 
-fn until(what: &str, reached: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !reached() {
-        assert!(started.elapsed() < PATIENCE, "never reached: {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
 #[test]
 fn killed_demo_leaves_no_nodes() {
     let directory = tempfile::tempdir().unwrap();
@@ -157,8 +144,8 @@ fn street_cell_outperforms_cameras_after_failover() {
     demo.args(["demo", "--scene", "street", "--seconds", "10", "--out"])
         .arg(directory.path());
     let output = demo.output().unwrap();
-    let told = String::from_utf8_lossy(&output.stdout);
-    assert!(output.status.success(), "{}{told}", stderr(&output));
+    let output_text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{}{output_text}", stderr(&output));
     let result: serde_json::Value =
         serde_json::from_slice(&std::fs::read(directory.path().join("result.json")).unwrap())
             .unwrap();
@@ -173,30 +160,32 @@ fn street_cell_outperforms_cameras_after_failover() {
     };
     let alone = known("alone");
     let with_cell = known("with_cell");
-    assert_eq!((alone.len(), with_cell.len()), (4, 4), "{told}");
+    assert_eq!((alone.len(), with_cell.len()), (4, 4), "{output_text}");
     let best_alone = alone.into_iter().fold(0.0, f64::max);
     assert!(
         with_cell.iter().all(|known| *known > best_alone + 1.0),
-        "{told}"
+        "{output_text}"
     );
     assert!(
         street["took_over"]
             .as_str()
             .is_some_and(|leader| leader != "edge"),
-        "nobody took over: {told}"
+        "no node took over: {output_text}"
     );
     assert!(
         street["failover_gap_ms"]
             .as_u64()
             .is_none_or(|gap_ms| gap_ms < 5000),
-        "{told}"
+        "{output_text}"
     );
     assert!(
         street["seen_only_by"]["galileo"].as_u64() > Some(0),
-        "{told}"
+        "{output_text}"
     );
     assert!(
-        told.contains("precision:") && told.contains("next: ") && told.contains(" try FILE"),
-        "words are explained and the next command is shown: {told}"
+        output_text.contains("precision:")
+            && output_text.contains("next: ")
+            && output_text.contains(" try FILE"),
+        "words are explained and the next command is shown: {output_text}"
     );
 }

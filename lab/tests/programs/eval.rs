@@ -6,12 +6,9 @@ use std::process::{Command, Output};
 
 use ecod::replay::{FusedLine, Replay, ReplayConfig, Summary};
 use ecod_actors::cli::cell;
+use ecod_testkit::{example, stderr};
 use serde_json::Value;
 use tempfile::TempDir;
-
-fn example(name: &str) -> PathBuf {
-    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../examples")).join(name)
-}
 
 fn ecod_lab(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_ecod-lab"))
@@ -35,15 +32,11 @@ fn eval(flags: &[&str], truth: &Path, input: &Path, out: &Path) -> Output {
 
 #[track_caller]
 fn succeeded(output: &Output) {
-    assert!(output.status.success(), "{}", said_by(output));
+    assert!(output.status.success(), "{}", stderr(output));
 }
 
 fn json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
-}
-
-fn said_by(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn text(path: &Path) -> &str {
@@ -171,9 +164,9 @@ fn moving_objects_use_past_positions() {
     let run = ecod_lab(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
     assert_eq!(run.status.code(), Some(2));
     assert!(
-        said_by(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"),
+        stderr(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"),
         "{}",
-        said_by(&run)
+        stderr(&run)
     );
 }
 
@@ -234,9 +227,9 @@ fn benchmark_file_errors_name_line() {
     ));
     assert_eq!(broken.status.code(), Some(2));
     assert!(
-        said_by(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"),
+        stderr(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"),
         "{}",
-        said_by(&broken)
+        stderr(&broken)
     );
 }
 
@@ -288,9 +281,9 @@ fn benchmark_detections_become_reports() {
     );
     let broken = convert(text(&left));
     assert!(
-        broken.status.code() == Some(2) && said_by(&broken).contains("is not NAME=FILE"),
+        broken.status.code() == Some(2) && stderr(&broken).contains("is not NAME=FILE"),
         "{}",
-        said_by(&broken)
+        stderr(&broken)
     );
 }
 
@@ -362,16 +355,16 @@ fn sequences_match_names_and_truth() {
     ] {
         let run = ecod_lab(&[&["convert", "--format", "mot"][..], &flags].concat());
         assert!(
-            run.status.code() == Some(2) && said_by(&run).contains(fault),
+            run.status.code() == Some(2) && stderr(&run).contains(fault),
             "{}",
-            said_by(&run)
+            stderr(&run)
         );
     }
     let run = judge(&path("more"));
     assert!(
-        run.status.code() == Some(2) && said_by(&run).contains("has 3 sequences"),
+        run.status.code() == Some(2) && stderr(&run).contains("has 3 sequences"),
         "{}",
-        said_by(&run)
+        stderr(&run)
     );
 }
 
@@ -506,13 +499,8 @@ fn unjudgeable_input_is_reported() {
         ),
     ] {
         let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);
-        assert_eq!(
-            run.status.code(),
-            Some(code),
-            "{truth:?}: {}",
-            said_by(&run)
-        );
-        assert!(said_by(&run).contains(part), "{truth:?}: {}", said_by(&run));
+        assert_eq!(run.status.code(), Some(code), "{truth:?}: {}", stderr(&run));
+        assert!(stderr(&run).contains(part), "{truth:?}: {}", stderr(&run));
     }
 }
 
@@ -576,7 +564,7 @@ fn missing_output_field_is_named() {
         text(&input),
     ]);
     assert!(!run.status.success());
-    let error = said_by(&run);
+    let error = stderr(&run);
     assert!(
         error.contains("verdicts: objects[0]: missing field `x_m`"),
         "{error}"

@@ -328,8 +328,8 @@ fn timeline_stays_in_order() {
     log.finish();
     // The later file first, as its name may have it.
     let html = page(&[&after, &before], r#"{"landmarks": {"a": "car"}}"#);
-    let told = timeline(&html);
-    let terms: Vec<_> = told["reigns"].as_array().unwrap().iter().collect();
+    let page_timeline = timeline(&html);
+    let terms: Vec<_> = page_timeline["reigns"].as_array().unwrap().iter().collect();
     let leaders: Vec<_> = terms
         .iter()
         .map(|term| term["leader"].as_str().unwrap())
@@ -337,14 +337,14 @@ fn timeline_stays_in_order() {
     assert_eq!(
         leaders,
         ["edge", "edge", "gauss", "edge"],
-        "no band where the log has nothing"
+        "no band where the log has no line"
     );
     assert_eq!(
         (&terms[1]["from_us"], &terms[1]["until_us"]),
         (&second(40).into(), &second(44).into())
     );
     assert_eq!(terms[3]["gap_ms"], 1000);
-    let texts: Vec<_> = told["events"]
+    let texts: Vec<_> = page_timeline["events"]
         .as_array()
         .unwrap()
         .iter()
@@ -355,15 +355,15 @@ fn timeline_stays_in_order() {
         "edge joined",
         "late: </script>5 s ahead. Remedy: chrony",
     ];
-    assert_eq!(texts, expected, "{told}");
-    let times: Vec<_> = told["frames"]
+    assert_eq!(texts, expected, "{page_timeline}");
+    let times: Vec<_> = page_timeline["frames"]
         .as_array()
         .unwrap()
         .iter()
         .map(|time| time.as_u64().unwrap())
         .collect();
     assert!(times.len() == 15 && times.is_sorted(), "{times:?}");
-    let scenes = told["scenes"].as_array().unwrap();
+    let scenes = page_timeline["scenes"].as_array().unwrap();
     let rounds: Vec<_> = scenes
         .iter()
         .map(|scene| scene["map"]["message"]["round"].as_u64().unwrap())

@@ -6,12 +6,11 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use ecod::leadership::BrokerAddress;
 use ecod_region::broker::{BrokerArguments, BrokerLogin};
 use ecod_region::reader::{self, Reading, RegionState};
-use ecod_testkit::output_of;
+use ecod_testkit::{output_of, until_blocking};
 use tempfile::TempDir;
 
 /// A broker and its directory; ended when dropped.
@@ -23,9 +22,26 @@ pub(crate) struct Broker {
     pub(crate) route: Option<SocketAddr>,
 }
 
-/// The place of cell `lot-1`, and of `far-1`, some kilometres off.
-pub(crate) const LOT: (&str, f64, f64) = ("lot-1", 48.8584, 2.2945);
-pub(crate) const FAR: (&str, f64, f64) = ("far-1", 48.80, 2.40);
+/// Name and place of a cell.
+#[derive(Clone, Copy)]
+pub(crate) struct PlacedCell {
+    pub(crate) name: &'static str,
+    pub(crate) latitude_deg: f64,
+    pub(crate) longitude_deg: f64,
+}
+
+pub(crate) const LOT: PlacedCell = PlacedCell {
+    name: "lot-1",
+    latitude_deg: 48.8584,
+    longitude_deg: 2.2945,
+};
+
+/// Some kilometres from [`LOT`].
+pub(crate) const FAR: PlacedCell = PlacedCell {
+    name: "far-1",
+    latitude_deg: 48.80,
+    longitude_deg: 2.40,
+};
 
 const DEPLOY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/region");
 
@@ -38,8 +54,8 @@ impl Broker {
             fs::copy(Path::new(DEPLOY).join(file), directory.path().join(file)).unwrap();
         }
         make_certificates(&directory.path().join("tls"));
-        for (name, latitude, longitude) in [LOT, FAR] {
-            add_cell(directory.path(), &[], (name, latitude, longitude));
+        for cell in [LOT, FAR] {
+            add_cell(directory.path(), &[], cell);
         }
         let mut command = Command::new("nats-server");
         command
@@ -112,12 +128,12 @@ impl Broker {
         let mut acl =
             "user region.reader\ntopic read ecod/v1/#\nuser town\ntopic write ecod/v1/#\n"
                 .to_owned();
-        for (name, latitude, longitude) in [LOT, FAR] {
-            acl += &account(&["--engine", "mosquitto"], name, latitude, longitude);
+        for cell in [LOT, FAR] {
+            acl += &account(&["--engine", "mosquitto"], cell);
         }
         fs::write(at("acl"), acl).unwrap();
         fs::create_dir(at("passwords")).unwrap();
-        for user in ["region.reader", "town", LOT.0, FAR.0] {
+        for user in ["region.reader", "town", LOT.name, FAR.name] {
             fs::write(at(&format!("passwords/{user}")), "secret\n").unwrap();
             let file = at("passwd");
             let made = directory.path().join("passwd").exists();
@@ -158,7 +174,7 @@ impl Broker {
             address,
             route: None,
         };
-        wait_for("the broker listens", || TcpStream::connect(address).is_ok());
+        until_blocking("the broker listens", || TcpStream::connect(address).is_ok());
         broker
     }
 
@@ -191,18 +207,14 @@ impl Broker {
     }
 
     /// The account of one more cell, which the server takes while it runs.
-    pub(crate) fn add_cell(&self, name: &str, latitude: f64, longitude: f64) {
-        add_cell(self.directory(), &[], (name, latitude, longitude));
+    pub(crate) fn add_cell(&self, cell: PlacedCell) {
+        add_cell(self.directory(), &[], cell);
         self.signal("HUP");
     }
 
     /// Another password for a cell, which the server takes while it runs.
-    pub(crate) fn renew_password(&self, name: &str, latitude: f64, longitude: f64) {
-        add_cell(
-            self.directory(),
-            &["--new-password"],
-            (name, latitude, longitude),
-        );
+    pub(crate) fn renew_password(&self, cell: PlacedCell) {
+        add_cell(self.directory(), &["--new-password"], cell);
         self.signal("HUP");
     }
 
@@ -256,21 +268,25 @@ impl Drop for Broker {
 }
 
 /// Runs `add-cell` as an operator does.
-fn add_cell(directory: &Path, flags: &[&str], (name, latitude, longitude): (&str, f64, f64)) {
+fn add_cell(directory: &Path, flags: &[&str], cell: PlacedCell) {
     output_of(
         Command::new(Path::new(DEPLOY).join("add-cell"))
             .args(flags)
-            .args([name, &latitude.to_string(), &longitude.to_string()])
+            .args([
+                cell.name,
+                &cell.latitude_deg.to_string(),
+                &cell.longitude_deg.to_string(),
+            ])
             .env("REGION_CONFIG", directory)
             .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region")),
     );
 }
 
-fn account(flags: &[&str], name: &str, latitude: f64, longitude: f64) -> String {
+fn account(flags: &[&str], cell: PlacedCell) -> String {
     let place = [
-        format!("--cell={name}"),
-        format!("--latitude={latitude}"),
-        format!("--longitude={longitude}"),
+        format!("--cell={}", cell.name),
+        format!("--latitude={}", cell.latitude_deg),
+        format!("--longitude={}", cell.longitude_deg),
     ];
     output_of(
         Command::new(env!("CARGO_BIN_EXE_ecod-region"))
@@ -307,22 +323,4 @@ pub(crate) fn free_address() -> SocketAddr {
         .unwrap()
         .local_addr()
         .unwrap()
-}
-
-/// Waits until something is so.
-pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
-    let patience = Instant::now() + Duration::from_secs(30);
-    while !is_so() {
-        assert!(Instant::now() < patience, "waited in vain until {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-/// Waits until something is so, while others go on.
-pub(crate) async fn until(what: &str, mut is_so: impl FnMut() -> bool) {
-    let patience = Instant::now() + Duration::from_secs(30);
-    while !is_so() {
-        assert!(Instant::now() < patience, "waited in vain until {what}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
 }

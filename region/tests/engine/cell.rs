@@ -13,11 +13,12 @@ use ecod::wire::{
 };
 use ecod_actors::platform::clock;
 use ecod_region::account::CellAccount;
+use ecod_testkit::until;
 use rumqttc::{AsyncClient, Event, LastWill, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-use crate::broker::Broker;
+use crate::broker::{Broker, PlacedCell};
 
 /// A cell's connection, and what came on it.
 pub(crate) struct Cell {
@@ -39,17 +40,14 @@ pub(crate) struct Received {
 
 impl Cell {
     /// Connects as this user.
-    pub(crate) fn connect(
-        broker: &Broker,
-        (name, latitude_deg, longitude_deg): (&'static str, f64, f64),
-    ) -> Self {
+    pub(crate) fn connect(broker: &Broker, cell: PlacedCell) -> Self {
         let origin = GeographicOrigin {
-            latitude_deg,
-            longitude_deg,
+            latitude_deg: cell.latitude_deg,
+            longitude_deg: cell.longitude_deg,
             height_m: 0.0,
             rotation_deg: 0.0,
         };
-        let (client, mut events) = AsyncClient::new(broker.login(name).options(), 4096);
+        let (client, mut events) = AsyncClient::new(broker.login(cell.name).options(), 4096);
         let received = Arc::new(Mutex::new(Received::default()));
         let noted = Arc::clone(&received);
         let polling = tokio::spawn(async move {
@@ -81,7 +79,7 @@ impl Cell {
             }
         });
         Self {
-            account: CellAccount::new(NodeName::from_static(name), &origin),
+            account: CellAccount::new(NodeName::from_static(cell.name), &origin),
             origin,
             client,
             received,
@@ -189,7 +187,7 @@ impl Cell {
             .iter()
             .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce));
         self.client.subscribe_many(wanted).await.unwrap();
-        crate::broker::until("the broker answers", || {
+        until("the broker answers", || {
             self.received().granted.len() == before + filters.len()
         })
         .await;

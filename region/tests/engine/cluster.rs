@@ -4,11 +4,12 @@ use std::io::Read;
 use std::net::TcpStream;
 use std::sync::Arc;
 
+use ecod_testkit::until;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, ServerName};
 use rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 
-use crate::broker::{Broker, LOT, until};
+use crate::broker::{Broker, LOT};
 use crate::cell::Cell;
 
 #[tokio::test(flavor = "multi_thread")]

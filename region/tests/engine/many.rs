@@ -16,11 +16,12 @@ use ecod::wire::{
     Role, SCHEMA_VERSION, Trouble, encode,
 };
 use ecod_actors::platform::clock;
+use ecod_testkit::{until, until_blocking};
 use rumqttc::{AsyncClient, QoS};
 use serde_json::Value;
 use uuid::Uuid;
 
-use crate::broker::{Broker, free_address, until};
+use crate::broker::{Broker, free_address};
 use crate::page::get;
 
 /// Cells along one side of the town, each in a tile of its own.
@@ -58,7 +59,7 @@ impl Reader {
             .spawn()
             .unwrap();
         let reader = Self { child, address };
-        crate::broker::wait_for("the page listens", || {
+        until_blocking("the page listens", || {
             std::net::TcpStream::connect(address).is_ok()
         });
         reader

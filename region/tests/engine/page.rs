@@ -9,9 +9,10 @@ use std::time::Duration;
 use ecod::wire::{NodeState, RegionTopicKind};
 use ecod_region::page::RegionPage;
 use ecod_region::reader::{self, RegionState};
+use ecod_testkit::until;
 use serde_json::Value;
 
-use crate::broker::{Broker, FAR, LOT, until};
+use crate::broker::{Broker, FAR, LOT};
 use crate::cell::Cell;
 
 /// Status and body of an answer.
@@ -85,7 +86,7 @@ async fn page_counts_cells_in_view() {
     let mut round = 0;
     let shown = loop {
         round += 1;
-        assert!(round < 300, "the map is never shown");
+        assert!(round < 300, "the map is not shown");
         publish(&lot, &far, round);
         tokio::time::sleep(Duration::from_millis(100)).await;
         let shown = look(near).await.unwrap();

@@ -5,8 +5,9 @@ use std::sync::{Arc, Mutex};
 
 use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
 use ecod_region::town::RegionTown;
+use ecod_testkit::until;
 
-use crate::broker::{Broker, FAR, LOT, until};
+use crate::broker::{Broker, FAR, LOT, PlacedCell};
 use crate::cell::Cell;
 
 /// Topics of messages that arrive at a reader of everything.
@@ -53,7 +54,7 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         lot.topic(RegionTopicKind::Map),
         far.topic(RegionTopicKind::Map),
     ];
-    until("both cells are heard", || {
+    until("messages of both cells arrive", || {
         both.iter()
             .all(|topic| arrived.lock().unwrap().contains(topic))
     })
@@ -68,16 +69,16 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
         lot.topic(RegionTopicKind::Status),
     ];
     for (topic, retain) in statuses.iter().zip([true, false]) {
-        Cell::vanish(broker, LOT.0, topic, retain).await;
+        Cell::vanish(broker, LOT.name, topic, retain).await;
     }
-    until("the own last will is heard", || {
+    until("the own last will arrives", || {
         arrived.lock().unwrap().contains(&statuses[1])
     })
     .await;
     // A client that subscribes later would receive a retained forgery.
     let later = listen(broker).await;
     lot.publish_map(2, 1);
-    until("the second reader hears", || {
+    until("the second reader receives maps", || {
         !later.lock().unwrap().is_empty()
     })
     .await;
@@ -103,7 +104,7 @@ async fn nats_rights_end_at_tile() {
     let heard = attack(&broker, &arrived).await;
     let lot = Cell::connect(&broker, LOT);
     let far = Cell::connect(&broker, FAR);
-    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
+    assert_eq!(heard, honest(&lot, &far), "no forged message");
 
     let tiles = lot.account.tile.with_neighbours();
     let around: Vec<_> = tiles
@@ -135,20 +136,24 @@ async fn mosquitto_rights_end_at_tile() {
     let lot = Cell::connect(&broker, LOT);
     let far = Cell::connect(&broker, FAR);
     let own = lot.topic(RegionTopicKind::Map);
-    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
+    assert_eq!(heard, honest(&lot, &far), "no forged message");
     // Subscriptions are granted, and nothing foreign comes.
     lot.subscribe(&["ecod/v1/#".to_owned()]).await;
     far.publish_map(2, 1);
     lot.publish_map(3, 1);
-    until("the own map is heard", || !lot.received().topics.is_empty()).await;
+    until("the own map arrives", || !lot.received().topics.is_empty()).await;
     assert_eq!(lot.received().topics, [own]);
 }
 
 /// A cell that is added while the server runs.
-const NEW: (&str, f64, f64) = ("new-1", 48.86, 2.30);
+const NEW: PlacedCell = PlacedCell {
+    name: "new-1",
+    latitude_deg: 48.86,
+    longitude_deg: 2.30,
+};
 
 /// Connects a cell, again and again until the server has taken its password.
-async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
+async fn admitted(broker: &Broker, place: PlacedCell) -> Cell {
     let mut cell = Cell::connect(broker, place);
     until("the cell is in", || {
         if cell.received().is_refused {
@@ -165,7 +170,7 @@ async fn adding_cell_disconnects_no_others() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     until("the cell is in", || lot.received().logins == 1).await;
-    broker.add_cell(NEW.0, NEW.1, NEW.2);
+    broker.add_cell(NEW);
     let added = admitted(&broker, NEW).await;
     added.publish(
         &added.topic(RegionTopicKind::Status),
@@ -177,7 +182,7 @@ async fn adding_cell_disconnects_no_others() {
     assert_eq!(lot.received().logins, 1);
 
     // It goes on with the password that it has.
-    broker.renew_password(NEW.0, NEW.1, NEW.2);
+    broker.renew_password(NEW);
     until("who has the former password is shut out", || {
         added.received().is_refused
     })

@@ -6,8 +6,9 @@ use std::time::{Duration, Instant};
 use ecod::neighbours::MAX_AGE;
 use ecod::wire::{CellMap, Limits, RejectReason, decode};
 use ecod_region::town::Accepted;
+use ecod_testkit::until;
 
-use crate::broker::{Broker, LOT, until};
+use crate::broker::{Broker, LOT};
 use crate::cell::Cell;
 
 /// Maximum map age beyond [`MAX_AGE`] that an estimate of the least delay may be off, on one machine.

@@ -65,7 +65,7 @@ fn overtaken_report_is_no_duplicate() {
         assert_eq!(
             admitted(&mut window, n),
             Err(RejectReason::OutOfOrder),
-            "nobody knows whether {n} came before"
+            "whether {n} came before is unknown"
         );
     }
     assert_eq!(
@@ -335,7 +335,7 @@ fn time_jump_costs_no_report() {
             offset_us += if n == 150 { -5_000_000 } else { YEAR_US };
             window.set_cell_offset(offset_us);
         }
-        let told = if n % 100 < 75 {
+        let stated_us = if n % 100 < 75 {
             [-YEAR_US, 0, -5_000_000][n as usize / 100]
         } else {
             offset_us
@@ -345,7 +345,7 @@ fn time_jump_costs_no_report() {
             (7_000, Ok(InOrder(sent))),
             (9_000, Err(RejectReason::OutOfOrder)),
         ] {
-            let admitted = window.admit(&in_cell_time(n, told), sent.shifted(transit_us));
+            let admitted = window.admit(&in_cell_time(n, stated_us), sent.shifted(transit_us));
             assert_eq!(admitted, expected, "report {n}");
         }
     }

@@ -306,7 +306,7 @@ fn wrong_clocks_are_named() {
     assert_eq!(
         off(Some("n3")),
         None,
-        "a clock that was never set says nothing to others"
+        "a clock that was not set is not sent to others"
     );
     let blamed: Vec<_> = cell.nodes[0]
         .time
@@ -328,7 +328,7 @@ fn wrong_clocks_are_named() {
         "{:?}",
         errors(2)
     );
-    assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
+    assert!(errors(3)[0].1 < -SECOND_US, "and its own node detects it");
 }
 
 /// A leader with a wrong clock that is not outvoted imposes its time on the cell; the other clocks

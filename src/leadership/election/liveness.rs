@@ -136,7 +136,7 @@ impl Following {
     /// First deadline: the leader is suspected.
     pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
         let late_at = self
-            .telling_interval()
+            .informative_interval()
             .map(|gap| self.direct_at + overdue(gap));
         let claimed_at = self.claim.as_ref().map(|claim| claim.0);
         [late_at, claimed_at]
@@ -159,7 +159,7 @@ impl Following {
         let silence = self.beat_interval * config.silence_beats;
         let unheard_at = self.bidirectional_at + silence.max(config.response_timeout());
         let missing_at = self
-            .telling_interval()
+            .informative_interval()
             .map(|gap| self.direct_at + missing(gap));
         let given_up_at = self
             .given_up
@@ -183,14 +183,14 @@ impl Following {
     /// may be as old as the leader's slowest beat interval.
     pub(super) fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let direct_timeout_at = self.direct_timeout_at(config);
-        let late = self.telling_interval().map(overdue);
+        let late = self.informative_interval().map(overdue);
         let margin = late.unwrap_or(if self.given_up {
             config.beat()
         } else {
             self.beat_interval
         });
-        let hears_us_until = self.bidirectional_at + self.beat_interval + margin;
-        if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
+        let receives_us_until = self.bidirectional_at + self.beat_interval + margin;
+        if self.indirect_heard_at > (self.direct_at + margin).min(receives_us_until) {
             direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
         } else if late.is_some() {
             // The standby, which gets more beats, gives the leader up first.
@@ -201,7 +201,7 @@ impl Following {
     }
 
     /// Interval between two rounds, if rounds are more informative than beats.
-    fn telling_interval(&self) -> Option<Duration> {
+    fn informative_interval(&self) -> Option<Duration> {
         self.round_interval.filter(|gap| *gap < self.beat_interval)
     }
 }

@@ -108,7 +108,7 @@ fn is_counted(effects: &[ElectionEffect]) -> bool {
 #[test]
 fn forged_term_blocks_no_election() {
     let mut election = euclid();
-    let mut hear = |seq, term| {
+    let mut receive = |seq, term| {
         let effects = election.handle(
             of_edge(
                 seq,
@@ -132,19 +132,19 @@ fn forged_term_blocks_no_election() {
     };
     let cell = 5000;
     assert_eq!(
-        hear(1, cell),
+        receive(1, cell),
         (cell, false),
-        "a node that joins learns the cell's term"
+        "a node that joins receives the cell's term"
     );
-    assert_eq!(hear(2, MAX_TERM), (cell, true));
-    assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), (cell, true));
-    assert_eq!(hear(4, cell + 1), (cell + 1, false));
+    assert_eq!(receive(2, MAX_TERM), (cell, true));
+    assert_eq!(receive(3, cell + MAX_TERM_STEP + 1), (cell, true));
+    assert_eq!(receive(4, cell + 1), (cell + 1, false));
 }
 
 #[test]
 fn forged_sequence_mutes_no_node() {
     let mut election = euclid();
-    let hear = |election: &mut Election, seq, term, now| {
+    let receive = |election: &mut Election, seq, term, now| {
         let status = Body::Status {
             over: None,
             no_login: Vec::new(),
@@ -152,21 +152,21 @@ fn forged_sequence_mutes_no_node() {
         let effects = election.handle(of_edge(seq, term, status), now);
         (election.term(), is_counted(&effects))
     };
-    assert_eq!(hear(&mut election, 1, 9, NOW), (9, false));
+    assert_eq!(receive(&mut election, 1, 9, NOW), (9, false));
     for forged in [2 + MAX_SEQ_STEP, (1 << 53) - 1, u64::MAX] {
-        assert_eq!(hear(&mut election, forged, 10, NOW), (9, true));
+        assert_eq!(receive(&mut election, forged, 10, NOW), (9, true));
     }
     assert_eq!(
-        hear(&mut election, 2, 11, NOW),
+        receive(&mut election, 2, 11, NOW),
         (11, false),
-        "the node itself is heard"
+        "the node itself answers"
     );
     let mut now = NOW;
     while now < NOW + Duration::from_secs(10) {
         now = now + Duration::from_millis(50);
         election.tick(now);
     }
-    let (_, is_counted) = hear(&mut election, 10 * MAX_SEQ_STEP, 12, now);
+    let (_, is_counted) = receive(&mut election, 10 * MAX_SEQ_STEP, 12, now);
     assert!(!is_counted, "a node that was out of reach is far ahead");
 }
 
@@ -437,12 +437,12 @@ fn early_contradiction_ends_no_leadership() {
         now = election.next_deadline();
         election.tick(now);
     }
-    let lie = Epoch::new(election.term() + 1, edge.clone());
-    let tell = |election: &mut Election, seq, now| {
+    let false_epoch = Epoch::new(election.term() + 1, edge.clone());
+    let send_false_round = |election: &mut Election, seq, now| {
         let message = message(
             &hopper,
             seq,
-            Some(&lie),
+            Some(&false_epoch),
             Body::Status {
                 over: None,
                 no_login: Vec::new(),
@@ -462,28 +462,28 @@ fn early_contradiction_ends_no_leadership() {
             now,
         );
     };
-    tell(&mut election, 1, now);
+    send_false_round(&mut election, 1, now);
     assert!(election.is_leading());
     // A true change of leader is announced by the other leader itself.
-    let mut told = election.clone();
-    told.handle(
+    let mut informed = election.clone();
+    informed.handle(
         received(
             &edge,
             3,
-            Some(&lie),
+            Some(&false_epoch),
             beat_after(election.epoch().cloned().as_ref()),
         ),
         now,
     );
-    assert_eq!(told.leader(), Some(&edge));
+    assert_eq!(informed.leader(), Some(&edge));
     let began = now;
     let mut seq = 1;
     while election.is_leading() {
         now = now + Duration::from_millis(50);
         seq += 1;
-        assert!(now.since(began) < Duration::from_secs(2), "nobody follows");
+        assert!(now.since(began) < Duration::from_secs(2), "no node follows");
         election.tick(now);
-        tell(&mut election, seq, now);
+        send_false_round(&mut election, seq, now);
     }
     assert!(
         now.since(began) > Duration::from_millis(800),
@@ -546,7 +546,7 @@ fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
 fn followed_leader_renews_no_term() {
     let time = Duration::from_secs(20);
     assert_eq!(renewals(true, time).len(), 1);
-    assert!(renewals(false, time).len() > 1, "nobody follows");
+    assert!(renewals(false, time).len() > 1, "no node follows");
 }
 
 #[test]
@@ -577,7 +577,7 @@ fn hourly_term_growth_is_bounded() {
     let beat = election.handle(of_edge(100, MAX_TERM, beat(88)), NOW);
     assert!(
         is_counted(&beat) && election.leader() == Some(&NodeName::from_static("edge")),
-        "heard all the same"
+        "received nevertheless"
     );
 }
 
@@ -634,7 +634,7 @@ fn foreign_resignation_changes_no_state() {
     election.handle(of_edge(1, 8, beat(1)), NOW);
     for (seq, term) in [(1, MAX_TERM), (2, 8 + MAX_TERM_STEP / 2)] {
         let epoch = Epoch::new(8 + MAX_TERM_STEP / 2, gauss.clone());
-        let lie = message(
+        let false_message = message(
             &gauss,
             seq,
             None,
@@ -645,7 +645,10 @@ fn foreign_resignation_changes_no_state() {
         );
         election.handle(
             ElectionInput::Receive {
-                message: ElectionMessage { term, ..lie },
+                message: ElectionMessage {
+                    term,
+                    ..false_message
+                },
             },
             NOW,
         );
@@ -817,10 +820,10 @@ fn node_parts_depose_no_leader() {
     let own = election.epoch().cloned();
     status(&mut election, &gauss, own.as_ref(), now);
     status(&mut election, &hopper, own.as_ref(), now);
-    let lie = Epoch::new(election.term() + 1, gauss);
+    let false_epoch = Epoch::new(election.term() + 1, gauss);
     for part in 0..15 {
         let part = NodeName::new(format!("mallory--{part}")).unwrap();
-        status(&mut election, &part, Some(&lie), now);
+        status(&mut election, &part, Some(&false_epoch), now);
     }
     assert!(election.is_leading());
 }
@@ -828,17 +831,23 @@ fn node_parts_depose_no_leader() {
 #[test]
 fn first_boot_joins_existing_cell() {
     let gauss = NodeName::from_static("gauss");
-    let lie = Epoch::new(MAX_FIRST_TERM - 1, gauss.clone());
+    let false_epoch = Epoch::new(MAX_FIRST_TERM - 1, gauss.clone());
     let mut election = euclid_after(1);
-    election.handle(received(&gauss, 1, Some(&lie), beat_after(None)), NOW);
-    assert_eq!(election.leader(), Some(&gauss), "nobody else is there");
+    election.handle(
+        received(&gauss, 1, Some(&false_epoch), beat_after(None)),
+        NOW,
+    );
+    assert_eq!(election.leader(), Some(&gauss), "no other node is present");
     let effects = election.handle(of_edge(1, 8, beat(1)), NOW);
     assert!(
         effects.contains(&ElectionEffect::PersistTerm { term: 9 }),
         "{effects:?}"
     );
     assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
-    election.handle(received(&gauss, 2, Some(&lie), beat_after(None)), NOW);
+    election.handle(
+        received(&gauss, 2, Some(&false_epoch), beat_after(None)),
+        NOW,
+    );
     let gone = ElectionInput::PeerGone {
         peer: NodeName::from_static("edge"),
     };

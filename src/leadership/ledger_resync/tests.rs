@@ -377,7 +377,11 @@ fn followers_evidence_reaches_next_leader() {
     a.receive(&b2.wait(2));
     assert_eq!(a.vehicles(), ["euclid", "gauss"]);
     b2.receive(&a.wait(1));
-    assert_eq!(b2.wait(2), [], "once the leader has it, nothing more comes");
+    assert_eq!(
+        b2.wait(2),
+        [],
+        "once the leader has it, no more requests are sent"
+    );
 }
 
 #[test]
@@ -478,7 +482,7 @@ fn unsigned_evidence_is_refused() {
     assert_eq!(
         (empty.is_news, empty.refused),
         (false, Vec::new()),
-        "there is nothing to sign"
+        "no entry is to be signed"
     );
     euclid.receive(&sign(vec![honest]));
     assert_eq!(euclid.incorrect("gauss"), 1);
@@ -538,14 +542,14 @@ fn invented_lane_has_no_effect() {
     assert_eq!(
         euclid.incorrect("gauss"),
         3,
-        "a leader is believed while it leads"
+        "a leader's evidence is accepted while it leads"
     );
     let over = EVIDENCE_PROBATION.as_millis() as u64;
     euclid.wait_until(over);
     euclid.leadership = following(9, "edge");
     let late = sign(vec![share("gauss", None, vec![slander(8, "gauss", 4)])]);
     euclid.merge(&late[0], over + 1000).unwrap();
-    assert_eq!(euclid.incorrect("gauss"), 4, "and in its last word");
+    assert_eq!(euclid.incorrect("gauss"), 4, "and in its last message");
     let later = sign(vec![share("gauss", None, vec![slander(8, "gauss", 5)])]);
     let merged = euclid
         .merge(&later[0], over + 1000 + LAST_WORD_TIME.as_millis() as u64)
@@ -666,7 +670,7 @@ fn reset_empties_all_ledgers() {
     assert_eq!(
         (answers.len(), euclid.vehicles().len()),
         (1, 0),
-        "a node that follows tells its leader"
+        "a follower sends its evidence to its leader"
     );
     assert!(leader.merge(&answers[0], 6010).unwrap().is_news);
     assert_eq!(leader.vehicles(), [""; 0]);
@@ -745,12 +749,12 @@ fn renewed_term_keeps_one_lane() {
     assert_eq!(
         merged.refused,
         [RejectReason::Unattested],
-        "its leader alone tells of it"
+        "only its leader sends it"
     );
     for candidate in [&edge, &gauss] {
         assert!(
             candidate.vehicles().contains(&"hopper".to_owned()),
-            "evidence of an earlier leader is forgotten"
+            "evidence of an earlier leader is dropped"
         );
         assert_eq!(
             candidate.ledger.totals()[&name("euclid")].0,

@@ -228,11 +228,11 @@ fn term_is_persisted_before_leading() {
     let persists = scene
         .position_of(|effect| matches!(effect, Effect::PersistTerm { term: 1 }))
         .unwrap();
-    let tells = scene.position_of(leads).unwrap();
+    let announces = scene.position_of(leads).unwrap();
     let lead = scene
         .position_of(|effect| matches!(effect, Effect::Lead { .. }))
         .unwrap();
-    assert!(persists < tells && tells < lead);
+    assert!(persists < announces && announces < lead);
 }
 
 #[test]
@@ -532,7 +532,7 @@ fn restarted_gateway_receives_links_and_status() {
         .filter(|effect| matches!(effect, Effect::SetLinks { .. }))
         .collect::<Vec<_>>()[..]
     else {
-        panic!("links are told once: {:?}", scene.effects)
+        panic!("links are reported once: {:?}", scene.effects)
     };
     let Effect::SetLinks { links } = links else {
         return;
@@ -588,12 +588,12 @@ fn unreachable_node_is_unfit_once() {
     scene.members.push(member("gauss", 3));
     scene.run_for(3000);
     assert!(!scene.machine.health.is_fit());
-    let told = scene
+    let count = scene
         .notices()
         .into_iter()
         .filter(|notice| matches!(notice, Notice::OutOfReach { .. }))
         .count();
-    assert_eq!(told, 1);
+    assert_eq!(count, 1);
 }
 
 #[test]
@@ -722,11 +722,9 @@ fn follower_priority_declares_no_role() {
             no_login: Vec::new(),
         },
     );
-    (
-        message.epoch,
-        message.candidacy.role,
-        message.candidacy.priority,
-    ) = (None, Role::Cav, 100);
+    message.epoch = None;
+    message.candidacy.role = Role::Cav;
+    message.candidacy.priority = 100;
     scene.handle_input(Input::Receive {
         from: name("edge"),
         rights: Rights::NONE,

@@ -79,10 +79,7 @@ mod tests {
         let mut may = |name: &NodeName, leadership: &Leadership, ms: u64| {
             filter.may_publish(name, leadership, Timestamp(ms * 1000))
         };
-        assert!(
-            may(&gauss, &Leadership::default(), 0),
-            "nobody is known to lead"
-        );
+        assert!(may(&gauss, &Leadership::default(), 0), "no leader is known");
         assert!(
             may(&edge, &led_by("edge"), 0)
                 && !may(&euclid, &led_by("edge"), 0)

@@ -412,7 +412,7 @@ mod tests {
                 .admit(&forged, round + 1, at(100 * round + 50), &leadership)
                 .ok();
         }
-        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and only once");
     }
 
     /// Each claim of a later term makes the leader renew its own.
@@ -440,14 +440,18 @@ mod tests {
                 )
                 .ok();
         }
-        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
+        assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and only once");
         let after = led_by(epoch(40, "gauss"), Some("euclid"));
         assert_eq!(
             filter.admit(&epoch(40, "gauss"), 1001, at(100_100), &after),
             Ok(())
         );
         let taken_over = filter.admit(&epoch(41, "euclid"), 1002, at(100_200), &after);
-        assert_eq!(taken_over, Ok(()), "beside another leader it has credit");
+        assert_eq!(
+            taken_over,
+            Ok(()),
+            "it has credit in addition to another leader"
+        );
     }
 
     #[test]
@@ -555,7 +559,7 @@ mod tests {
         assert_eq!(
             (0..60).find(taken),
             Some(35),
-            "half a second to be believed, and three for what was saved"
+            "half a second until it is accepted, and three for saved state"
         );
     }
 
@@ -602,7 +606,7 @@ mod tests {
             assert_eq!(
                 filter.admit(&elected, 0, at(210), &leadership),
                 Ok(()),
-                "its first word comes late"
+                "its first message arrives late"
             );
             assert_eq!(
                 filter.admit(&rival, 3, at(300), &leadership),
@@ -687,7 +691,7 @@ mod tests {
         assert_eq!(
             filter.admit(&later, 21, at(10_100), &seeking_in_12),
             Ok(()),
-            "the election has heard of it"
+            "the election has received it"
         );
         assert_eq!(
             filter.admit(&next, 22, at(20_000), &seeking_in_12),

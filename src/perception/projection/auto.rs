@@ -24,37 +24,37 @@ pub(super) fn line_of_sight(
     let (foot, head) = box_height::foot_and_head(bounds, projection);
     let half = HalfDepth::of(size, bounds, &foot, projection);
     let on_ground = || ground::from_foot(&foot, half, projection);
-    let estimate = match (cut.lower, cut.upper, size) {
-        (false, false, Some(size)) => {
-            let upright = box_height::upright(&foot, &head, size, half)
-                .ok_or_else(|| ProjectionError::DegenerateBox(label.clone()))?;
-            on_ground()
-                .and_then(|grounded| grounded.combined_with(&upright))
-                .unwrap_or(upright)
-        }
-        (false, false, None) => on_ground().ok_or_else(unknown_size)?,
-        (false, true, _) => on_ground().ok_or_else(clipped)?,
-        (true, upper, Some(size)) => {
-            let from_head = if upper {
-                None
-            } else {
-                ground::from_head(&head, size, half, projection)
-            };
-            let by_head = from_head.map(|estimate| {
-                estimate.along(
-                    &head,
-                    half.middle_sigma_m(estimate.distance_m, cut, &head, projection),
-                )
-            });
-            let by_width = || box_width::line_of_sight(bounds, &half.seen_width(size), projection);
-            let ways = [by_head, (!cut.side).then(by_width)];
-            let best = ways
-                .into_iter()
-                .flatten()
-                .min_by(|a, b| a.along_m.total_cmp(&b.along_m));
-            return best.ok_or_else(clipped);
-        }
-        (true, _, None) => return Err(clipped()),
+    if cut.lower {
+        let size = size.ok_or_else(clipped)?;
+        let from_head = if cut.upper {
+            None
+        } else {
+            ground::from_head(&head, size, half, projection)
+        };
+        let by_head = from_head.map(|estimate| {
+            estimate.along(
+                &head,
+                half.middle_sigma_m(estimate.distance_m, cut, &head, projection),
+            )
+        });
+        let by_width = || box_width::line_of_sight(bounds, &half.seen_width(size), projection);
+        let ways = [by_head, (!cut.side).then(by_width)];
+        let best = ways
+            .into_iter()
+            .flatten()
+            .min_by(|a, b| a.along_m.total_cmp(&b.along_m));
+        return best.ok_or_else(clipped);
+    }
+    let estimate = if cut.upper {
+        on_ground().ok_or_else(clipped)?
+    } else if let Some(size) = size {
+        let upright = box_height::upright(&foot, &head, size, half)
+            .ok_or_else(|| ProjectionError::DegenerateBox(label.clone()))?;
+        on_ground()
+            .and_then(|grounded| grounded.combined_with(&upright))
+            .unwrap_or(upright)
+    } else {
+        on_ground().ok_or_else(unknown_size)?
     };
     Ok(estimate.along(
         &foot,

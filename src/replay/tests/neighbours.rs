@@ -75,7 +75,7 @@ fn neighbour_objects_replay_exactly() {
             offset_us: 1_000_000,
         }));
         if ms % 500 == 0 && ms <= 2000 {
-            commands.push(Command::TakeNeighbours {
+            commands.push(Command::OnNeighbours {
                 objects: neighbours(ms),
                 stated_at: at(ms),
             });

@@ -198,7 +198,7 @@ fn smaller_identity_wins_at_equal_age() {
 
 /// Four moving and two standing cars, detected by three vehicles. In each of its maps the neighbour states the objects
 /// that `lie` returns. Returns the positions of the certain objects of each round.
-fn lied_to(
+fn run_with_false_reports(
     tracker: &mut Tracker,
     mut lie: impl FnMut(u64, &[FusedObject]) -> Vec<NeighbourObject>,
 ) -> Vec<Vec<[f64; 2]>> {
@@ -242,7 +242,7 @@ fn unconfirmed_cell_loses_trust() {
             neighbour_car(number, 4.0 * number as f64 - 20.0, -20.0, [0.0, 0.0]),
         )
     };
-    lied_to(&mut tracker, |_, _| (0..8).map(ghost).collect());
+    run_with_false_reports(&mut tracker, |_, _| (0..8).map(ghost).collect());
     assert_eq!(tracker.trust_in_cell(&name("liar")), 0.0);
     assert!(tracker.hides(&ghost(1)));
     // The ghost is not handed over: a car that comes to its position has an identity of this cell.
@@ -265,7 +265,7 @@ fn unconfirmed_cell_loses_trust() {
 #[test]
 fn identity_changes_do_not_evade_judgement() {
     let mut tracker = tracker();
-    lied_to(&mut tracker, |frame, _| {
+    run_with_false_reports(&mut tracker, |frame, _| {
         let ghost = |number: u128| {
             neighbour_car(
                 1000 * u128::from(frame) + number,
@@ -288,9 +288,9 @@ proptest! {
     /// identities of the objects.
     #[test]
     fn false_cell_harms_no_object(seed in prop_oneof![1 => Just(4_861_703_545_525_720_796), 5 => any::<u64>()]) {
-        let honest = lied_to(&mut tracker(), |_, _| Vec::new());
+        let honest = run_with_false_reports(&mut tracker(), |_, _| Vec::new());
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let lied = lied_to(&mut tracker(), |frame, own| {
+        let deceived = run_with_false_reports(&mut tracker(), |frame, own| {
             let ghost = |number: u128, rng: &mut ChaCha8Rng| {
                 let copied = own.get(rng.random_range(0..8_usize));
                 let [x_m, y_m] = copied.map_or([noise(rng, 40.0), noise(rng, 40.0)], |own| [own.x_m, own.y_m]);
@@ -305,10 +305,10 @@ proptest! {
             let number = |place: u64| u128::from(if frame % 4 == 0 { place } else { 100 * frame + place });
             (0..12).map(|place| stated("liar", 1.4 * rng.random::<f64>(), ghost(number(place), &mut rng))).collect()
         });
-        for (frame, (honest, lied)) in honest.iter().zip(&lied).enumerate().skip(5) {
-            prop_assert_eq!(honest.len(), lied.len(), "frame {}: {:?} and {:?}", frame, honest, lied);
-            for (honest, lied) in honest.iter().zip(lied) {
-                let off_m = (honest[0] - lied[0]).hypot(honest[1] - lied[1]);
+        for (frame, (honest, deceived)) in honest.iter().zip(&deceived).enumerate().skip(5) {
+            prop_assert_eq!(honest.len(), deceived.len(), "frame {}: {:?} and {:?}", frame, honest, deceived);
+            for (honest, deceived) in honest.iter().zip(deceived) {
+                let off_m = (honest[0] - deceived[0]).hypot(honest[1] - deceived[1]);
                 prop_assert!(off_m < 0.3, "frame {frame}: {off_m} m");
             }
         }

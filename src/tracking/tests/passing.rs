@@ -42,8 +42,8 @@ fn passing_vehicle_counts_no_misses() {
     );
 }
 
-/// Existence of a car that `believer` reports alone or together with `liar`, while two vehicles observe an empty place.
-fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
+/// Existence of a car that `claimant` reports alone or together with `liar`, while two vehicles observe an empty place.
+fn existence_of_false_car(is_liar_present: bool) -> f64 {
     let mut tracker = tracker();
     tracker.sensors.dormant.keep([(
         name("liar"),
@@ -51,10 +51,10 @@ fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
     )]);
     let mut round = TracksRound::default();
     for frame in 0..15 {
-        let believers = ["believer", "liar"]
+        let reporters = ["claimant", "liar"]
             .into_iter()
-            .take(1 + usize::from(is_liar_beside));
-        for node in believers {
+            .take(1 + usize::from(is_liar_present));
+        for node in reporters {
             tracker.observe(report(node, frame, vec![car(0.0, 20.0)]), at(frame));
         }
         for (n, node) in ["a", "b"].into_iter().enumerate() {
@@ -88,7 +88,7 @@ fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
 
 #[test]
 fn faulty_vehicle_is_no_second_witness() {
-    let [with_liar, without] = [true, false].map(existence_of_a_ghost);
+    let [with_liar, without] = [true, false].map(existence_of_false_car);
     assert!(
         with_liar < without + 0.02,
         "{with_liar} with a malicious vehicle, {without} without"
@@ -184,7 +184,7 @@ fn foreign_heading_yields_to_course() {
     assert_eq!(
         taken_over.objects[0].heading_rad,
         Some(heading_rad),
-        "until more is known"
+        "until more evidence arrives"
     );
     let north = drive(&mut newcomer, 30..70, |frame| [30.0, frame - 30.0]);
     let heading_rad = sure(&north)[0].heading_rad.unwrap();

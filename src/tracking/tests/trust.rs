@@ -9,7 +9,7 @@ use crate::tracking::trust::{DormantCounts, TrustCounts};
 #[test]
 fn fabricating_or_hiding_costs_trust() {
     let mut tracker = tracker();
-    let counts = liars(&mut tracker);
+    let counts = run_faulty_vehicles(&mut tracker);
     for honest in ["a", "b", "c", "d"] {
         let (right, wrong) = counts[&name(honest)];
         assert!(right > 20 && wrong == 0, "{honest} {right} {wrong}");
@@ -117,7 +117,7 @@ fn sure_vehicle_cannot_outweigh_misses() {
 #[test]
 fn distrust_survives_silence() {
     let mut tracker = tracker();
-    liars(&mut tracker);
+    run_faulty_vehicles(&mut tracker);
     let mut round = tracker.close(at(400));
     assert!(
         round.objects.is_empty() && tracker.sensors.iter().next().is_none(),
@@ -131,11 +131,11 @@ fn distrust_survives_silence() {
         tracker.observe(report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
         round = tracker.close(at(frame));
     }
-    let believed: Vec<_> = sure(&round)
+    let accepted: Vec<_> = sure(&round)
         .iter()
         .map(|object| object.x_m.round())
         .collect();
-    assert_eq!(believed, [50.0], "{:?}", round.objects);
+    assert_eq!(accepted, [50.0], "{:?}", round.objects);
 }
 
 #[test]
@@ -178,16 +178,16 @@ fn wrong_votes_lower_track_trust() {
         tracker.learn(&[wrong("liar"), wrong("unheard")]);
         round = tracker.close(at(frame));
     }
-    let believed: Vec<_> = sure(&round)
+    let accepted: Vec<_> = sure(&round)
         .iter()
         .map(|object| object.x_m.round())
         .collect();
-    assert_eq!(believed, [50.0], "{:?}", round.objects);
+    assert_eq!(accepted, [50.0], "{:?}", round.objects);
 }
 
 /// Four honest vehicles, one vehicle that hides most objects and one that invents objects; returns the correct and
 /// incorrect statements.
-fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
+fn run_faulty_vehicles(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let view = Some(FieldOfView {
         range_m: 60.0,

@@ -79,18 +79,18 @@ fn confidences_help_or_are_harmless() {
     let (same_online, same_refined) = accuracy(|_, _, _| 0.37);
     assert!((same_online - online).abs() < 0.2 && (same_refined - refined).abs() < 0.2);
     type Statement = fn(usize, f64, f64) -> f64;
-    let telling: [(&str, Statement); 3] = [
+    let informative: [(&str, Statement); 3] = [
         ("calibrated", |_, p, _| p),
         ("overconfident", |_, p, _| p.powf(0.25)),
         ("on scales of their own", |vehicle, p, _| {
             p * (0.3 + 0.1 * vehicle as f64).min(1.0)
         }),
     ];
-    for (name, state) in telling {
-        let (telling_online, telling_refined) = accuracy(state);
+    for (name, state) in informative {
+        let (informative_online, informative_refined) = accuracy(state);
         assert!(
-            telling_online > online + 0.5 && telling_refined > refined + 0.5,
-            "{name}: {telling_online} {online} {telling_refined} {refined}"
+            informative_online > online + 0.5 && informative_refined > refined + 0.5,
+            "{name}: {informative_online} {online} {informative_refined} {refined}"
         );
     }
     let useless: [(&str, Statement); 3] = [

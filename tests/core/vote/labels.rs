@@ -29,7 +29,7 @@ fn report(node: &str, seq: u64, votes: &[(String, String)]) -> (ObjectReport, Ti
     )
 }
 
-fn say(vote: &mut Vote, node: &str, seq: u64, votes: &[(String, String)]) {
+fn vote_as(vote: &mut Vote, node: &str, seq: u64, votes: &[(String, String)]) {
     let (report, at) = report(node, seq, votes);
     vote.observe(&report, at).unwrap();
 }
@@ -50,15 +50,15 @@ fn new_labels_survive_label_flood() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
     for round in 1..40 {
         // The malicious vehicle reports first, last, and also at the place of the others.
-        say(&mut vote, "liar", 2 * round, &inventions(2 * round, 300));
+        vote_as(&mut vote, "liar", 2 * round, &inventions(2 * round, 300));
         let new = format!("thing-{}", round / 10);
         for honest in ["a", "b", "c"] {
             let votes = [vote_for("known", "cup"), vote_for("changing", &new)];
-            say(&mut vote, honest, 2 * round, &votes);
+            vote_as(&mut vote, honest, 2 * round, &votes);
         }
-        let mut lies = inventions(2 * round + 1, 300);
-        lies.push(vote_for("known", &format!("invented-{round}")));
-        say(&mut vote, "liar", 2 * round + 1, &lies);
+        let mut false_votes = inventions(2 * round + 1, 300);
+        false_votes.push(vote_for("known", &format!("invented-{round}")));
+        vote_as(&mut vote, "liar", 2 * round + 1, &false_votes);
         let verdicts = vote
             .close(START + ROUND * u32::try_from(2 * round + 1).unwrap())
             .verdicts;
@@ -87,7 +87,7 @@ fn lone_vehicle_keeps_latest_labels() {
         Vec::new(),
     );
     for round in 0..100 {
-        say(
+        vote_as(
             &mut vote,
             "a",
             round,
@@ -133,7 +133,7 @@ fn full_ledger_admits_cell_labels() {
         vote.adopt(&ledger);
         ["a", "b"]
             .iter()
-            .for_each(|node| say(&mut vote, node, 1, &[vote_for("x", "zebra")]));
+            .for_each(|node| vote_as(&mut vote, node, 1, &[vote_for("x", "zebra")]));
         assert_eq!(
             vote.close(START + ROUND).verdicts[0].label.as_deref(),
             Some("zebra")
@@ -150,7 +150,7 @@ fn evicted_votes_are_counted() {
         },
         Vec::new(),
     );
-    say(&mut vote, "a", 1, &inventions(1, 20));
+    vote_as(&mut vote, "a", 1, &inventions(1, 20));
     let lost = vote
         .close(START + ROUND)
         .verdicts
@@ -194,7 +194,7 @@ fn landmark_synonyms_override_cell_synonyms() {
                 "bottle"
             };
             let mut vote = Vote::new(config.clone(), landmarks);
-            say(
+            vote_as(
                 &mut vote,
                 "a",
                 1,

@@ -13,10 +13,10 @@ const LABELS: [&str; 5] = ["car", "cup", "mouse", "sports ball", "vase"];
 const PERIOD: Duration = Duration::from_millis(100);
 const ROUNDS: u64 = 600;
 
-/// Vehicles of which the first `liars` state the same wrong labels always; the others are right in 80 % of frames.
+/// Vehicles of which the first `faulty` state the same wrong labels always; the others are right in 80 % of frames.
 struct Cell {
     vehicles: usize,
-    liars: usize,
+    faulty: usize,
     landmarks: usize,
 }
 
@@ -36,7 +36,7 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
         for vehicle in 0..cell.vehicles {
             let mut see = |truth: usize| {
                 let is_right = rng.random_bool(0.8);
-                if vehicle < cell.liars {
+                if vehicle < cell.faulty {
                     (truth + 1) % LABELS.len()
                 } else if is_right {
                     truth
@@ -75,19 +75,19 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
 
 #[test]
 fn stationary_objects_have_steady_verdicts() {
-    for (vehicles, liars) in [(3, 0), (5, 0), (3, 1), (5, 2), (9, 4)] {
+    for (vehicles, faulty) in [(3, 0), (5, 0), (3, 1), (5, 2), (9, 4)] {
         for landmarks in [1, 3, 6] {
             for seed in 1..=3 {
                 let (right, changes) = run(
                     &Cell {
                         vehicles,
-                        liars,
+                        faulty,
                         landmarks,
                     },
                     seed,
                 );
                 let cell = format!(
-                    "{vehicles} vehicles, {liars} liars, {landmarks} landmarks, seed {seed}"
+                    "{vehicles} vehicles, {faulty} faulty, {landmarks} landmarks, seed {seed}"
                 );
                 assert!(right >= 99.0, "{cell}: {right} % right");
                 assert!(changes <= landmarks, "{cell}: {changes} changes");

@@ -7,7 +7,7 @@ use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
 
 const AT: Timestamp = Timestamp(1_700_000_000_000_000);
 
-fn say(vote: &mut Vote, node: &str, seq: u64, votes: &[(&str, &str)]) {
+fn vote_as(vote: &mut Vote, node: &str, seq: u64, votes: &[(&str, &str)]) {
     let object = |&(landmark, label): &(&str, &str)| PerceivedObject {
         landmark: Some(landmark.into()),
         ..PerceivedObject::new(label, 0.8, 0.0, 0.0)
@@ -40,10 +40,10 @@ fn corrected_answer_counts_once() {
     };
     let answers = |labels: &[&str]| {
         let mut vote = Vote::new(config.clone(), Vec::new());
-        say(&mut vote, "b", 1, &[("y", "cup"), ("z", "mouse")]);
+        vote_as(&mut vote, "b", 1, &[("y", "cup"), ("z", "mouse")]);
         (1..)
             .zip(labels)
-            .for_each(|(seq, label)| say(&mut vote, "a", seq, &[("x", label)]));
+            .for_each(|(seq, label)| vote_as(&mut vote, "a", seq, &[("x", label)]));
         let online = on(&vote.close(AT).verdicts, "x").clone();
         (
             online,
@@ -78,8 +78,8 @@ fn wavering_landmark_leaves_others_counting() {
         ("f", "cup", "mouse"),
     ] {
         let place = if node == "f" { "alone" } else { "x" };
-        say(&mut vote, node, 1, &[(place, first)]);
-        say(&mut vote, node, 2, &[(place, second)]);
+        vote_as(&mut vote, node, 1, &[(place, first)]);
+        vote_as(&mut vote, node, 2, &[(place, second)]);
     }
     for (node, y, z) in [
         ("a", "cup", "mouse"),
@@ -88,7 +88,7 @@ fn wavering_landmark_leaves_others_counting() {
         ("d", "mouse", "cup"),
         ("e", "mouse", "cup"),
     ] {
-        say(&mut vote, node, 3, &[("y", y), ("z", z)]);
+        vote_as(&mut vote, node, 3, &[("y", y), ("z", z)]);
     }
     let verdicts = vote.refine(1).collect::<Vec<_>>();
     let labels = ["y", "z"].map(|place| on(&verdicts, place).label.as_deref());

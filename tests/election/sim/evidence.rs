@@ -153,7 +153,7 @@ impl World {
     /// leadership comes only from its leader.
     fn judge_merge(&self, to: usize, share: &LedgerShare) {
         let node = &self.nodes[to];
-        let mut told = ReputationLedger::default();
+        let mut received = ReputationLedger::default();
         let counts = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
             let is_of_leader = |now: &Epoch| now.leader == lane.leader && lane <= *now;
@@ -165,8 +165,8 @@ impl World {
             .entries
             .iter()
             .filter(|entry| counts(entry.epoch, &entry.aggregator));
-        told.merge_entries(entries.cloned(), None);
-        told.merge_marks(
+        received.merge_entries(entries.cloned(), None);
+        received.merge_marks(
             share
                 .marks
                 .iter()
@@ -174,7 +174,7 @@ impl World {
                 .cloned(),
             None,
         );
-        let lacks = told.beyond(&node.ledger);
+        let lacks = received.beyond(&node.ledger);
         assert!(
             lacks.0.is_empty() && lacks.1.is_empty(),
             "{} received {lacks:?} and does not have it",

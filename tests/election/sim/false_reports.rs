@@ -226,7 +226,7 @@ const FALSE_REPORTS: [FalseReport; 16] = [
     },
     FalseReport {
         message: "status",
-        description: "receives nobody",
+        description: "receives no node",
         claims: false,
         state: |scene| Statement {
             hears_you: false,

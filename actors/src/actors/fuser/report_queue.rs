@@ -208,7 +208,7 @@ mod tests {
         assert_eq!(of_parts, OBJECT_BURST as usize / 1000);
         assert!(
             push("mallory", start + 200, 0),
-            "a report without objects costs nothing"
+            "a report without objects has no cost"
         );
         assert!(push("euclid", start + 200, 1000));
         assert!(push("mallory", start + 200_000, 1000), "it earns new ones");

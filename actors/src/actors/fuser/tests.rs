@@ -22,7 +22,7 @@ fn spans() -> Spans {
 
 fn map(epoch: &Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = Arc::new(GlobalMap::new(epoch, round, Timestamp(0)));
-    FollowerMessage::TakeMap {
+    FollowerMessage::HandleMap {
         delivery: Delivery::local(map, received_at),
     }
 }
@@ -56,7 +56,7 @@ async fn forged_map_replaces_no_leader() {
         ..Leadership::default()
     };
     for leadership in [elected, seeking] {
-        let (fuser, mut told) = listening::slot().await;
+        let (fuser, mut messages) = listening::slot().await;
         let newest = Newest::default();
         let arguments = FollowerArguments {
             newest: newest.clone(),
@@ -92,7 +92,7 @@ async fn forged_map_replaces_no_leader() {
 
         let mut fuser = standby();
         let mut maps = 0;
-        while let Ok(FuserMessage::TakeMap { map, received_at }) = told.try_recv() {
+        while let Ok(FuserMessage::HandleMap { map, received_at }) = messages.try_recv() {
             fuser.on_map(map, received_at);
             maps += 1;
         }
@@ -108,7 +108,7 @@ async fn forged_map_replaces_no_leader() {
 #[tokio::test]
 async fn expelled_leaders_map_is_dropped() {
     let mut fuser = standby();
-    let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
+    let FollowerMessage::HandleMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
         panic!("a map")
     };
     fuser.on_map(Arc::clone(&delivery.message), Timestamp(1));
@@ -159,11 +159,11 @@ fn wrong_clock_is_reported() {
             _ => {}
         }
     }
-    let told = troubles(&fuser);
+    let reported = troubles(&fuser);
     let about = Some("late".to_owned());
     let corrected = "its clock is 5.0 s ahead; its reports are put right by that";
     assert_eq!(
-        told,
+        reported,
         [(about, "clock_off".into(), corrected.into())],
         "refused no longer"
     );
@@ -181,11 +181,12 @@ fn time_in_seconds_is_reported() {
         );
         take(&mut fuser, report, received_at, None);
     }
-    let told = troubles(&fuser);
+    let reported = troubles(&fuser);
     assert!(
-        told.iter()
+        reported
+            .iter()
             .any(|(_, _, cause)| cause.contains("`captured_at_us` looks like seconds")),
-        "{told:?}"
+        "{reported:?}"
     );
 }
 
@@ -229,11 +230,11 @@ fn vehicle_in_centimetres_is_reported() {
             take(&mut fuser, report, at, None);
         }
     }
-    let told: Vec<_> = troubles(&fuser)
+    let reported: Vec<_> = troubles(&fuser)
         .into_iter()
         .map(|(about, kind, _)| (about.unwrap_or_default(), kind))
         .collect();
-    assert_eq!(told, [("watson".to_owned(), "misplaced".to_owned())]);
+    assert_eq!(reported, [("watson".to_owned(), "misplaced".to_owned())]);
 }
 
 /// Two programs with one name are reported; a program that restarts is not.
@@ -255,11 +256,11 @@ fn two_same_named_programs_reported() {
                 None,
             );
         }
-        let told = troubles(&fuser);
+        let reported = troubles(&fuser);
         assert_eq!(
-            told.iter().any(|(_, kind, _)| kind == "name_taken"),
+            reported.iter().any(|(_, kind, _)| kind == "name_taken"),
             is_told,
-            "{told:?}"
+            "{reported:?}"
         );
     }
 }
@@ -272,7 +273,7 @@ fn unplaceable_vehicle_is_reported() {
     let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 3\ny_m = 0").unwrap();
     fuser.aggregator =
         Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for n in 1..=120 {
         let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
         for (name, scale) in [("watson", 100.0), ("euclid", 1.0)] {
@@ -287,8 +288,12 @@ fn unplaceable_vehicle_is_reported() {
             PerceivedObject::new("car", 0.9, 800.0, 0.0),
         ];
         take(&mut fuser, gauss, at, None);
-        told = troubles(&fuser);
-        assert_eq!(told.len(), if n <= 100 { 1 } else { 2 }, "{n}: {told:?}");
+        reported = troubles(&fuser);
+        assert_eq!(
+            reported.len(),
+            if n <= 100 { 1 } else { 2 },
+            "{n}: {reported:?}"
+        );
     }
     let of = |name: &str, cause: &str| {
         (
@@ -299,7 +304,7 @@ fn unplaceable_vehicle_is_reported() {
     };
     let far = of("gauss", "an object of its report is 800 m from its pose");
     assert_eq!(
-        told,
+        reported,
         [
             far,
             of(

@@ -160,12 +160,14 @@ impl ElectionDriver {
                         if let Some(stamp) = message.description.as_deref().copied() {
                             let may_lead = rights.limit_role(message.candidacy.role) != Role::Cav;
                             let may_describe = may_lead && rights.may_describe;
-                            self.parts.description.send(DescriptionKeeperMessage::Hear {
-                                from: from.clone(),
-                                may_lead,
-                                may_describe,
-                                stamp,
-                            });
+                            self.parts
+                                .description
+                                .send(DescriptionKeeperMessage::HandleStamp {
+                                    from: from.clone(),
+                                    may_lead,
+                                    may_describe,
+                                    stamp,
+                                });
                         }
                         self.cell_time.receive(&message, rights, clock::now());
                     }

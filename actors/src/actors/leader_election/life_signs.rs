@@ -195,7 +195,7 @@ mod tests {
         };
         assert!(
             !seeker.is_proven(&evidence(life_of(&edge, 500))),
-            "a leader that was never met"
+            "a leader without contact so far"
         );
         seeker.member_up(
             &NodeName::from_static("edge"),

@@ -147,12 +147,12 @@ async fn foreign_evidence_is_judged() {
 
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();
     let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else {
-        panic!("the leader is told")
+        panic!("no share was published")
     };
     assert_eq!(
         share.entries.len(),
         1,
-        "a node that has led tells a new leader what it counted before"
+        "a former leader sends its earlier counts to the new leader"
     );
 }
 
@@ -341,7 +341,7 @@ async fn new_certificate_restores_no_counts() {
     assert_eq!(
         votes(&restarted),
         (1, 0),
-        "a certificate that is renewed changes nothing"
+        "a renewed certificate keeps the evidence"
     );
 
     certificates
@@ -383,7 +383,7 @@ async fn candidates_broker_relays_no_vouching() {
             .ledger
             .totals()
             .is_empty(),
-        "gauss did not say that"
+        "gauss did not send this evidence"
     );
     assert_eq!(counters.rejects(RejectReason::Unattested), 1);
     assert_eq!(
@@ -448,7 +448,7 @@ async fn poisoned_ledger_is_refused() {
     assert_eq!(
         vehicles(Some(certificates.of("euclid"))),
         0,
-        "nobody signed it"
+        "the evidence has no signature"
     );
 
     reset_saved(&file, &name("lot"), &name("euclid"), Timestamp(5)).unwrap();
@@ -503,9 +503,9 @@ async fn saved_ledger_obeys_wire_bounds() {
         let entry = entry(term, label, incorrect);
         let own = format!(r#""entries":[{entry}],"standing":{{}}"#);
         assert_eq!(restored(&own), (expected, 0, none), "{own}");
-        let told = format!(r#"{{"schema":1,"node":"edge","entries":[{entry}]}}"#);
-        let told = format!(r#""entries":[],"standing":{{}},"statements":[{told}]"#);
-        assert_eq!(restored(&told), (expected, 0, none), "{told}");
+        let stated = format!(r#"{{"schema":1,"node":"edge","entries":[{entry}]}}"#);
+        let stated = format!(r#""entries":[],"standing":{{}},"statements":[{stated}]"#);
+        assert_eq!(restored(&stated), (expected, 0, none), "{stated}");
     }
     let mark = |correct| {
         let mark = format!(
@@ -558,7 +558,7 @@ async fn node_from_1970_uses_cell_time() {
     assert_eq!(
         reset_at(&keeper),
         Timestamp(0),
-        "decades ahead, as far as it knows"
+        "decades ahead of the node's clock"
     );
     keeper.arguments.clock.show(ClockReading {
         offset_us: now.micros() as i64,
@@ -656,7 +656,7 @@ async fn restart_widens_no_count_jump() {
 #[tokio::test]
 async fn election_receives_only_verified_evidence() {
     let (gateway, _published) = listening::slot().await;
-    let (election, mut told) = listening::slot().await;
+    let (election, mut messages) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
     let credentials = Some(certificates.of("euclid"));
@@ -681,7 +681,7 @@ async fn election_receives_only_verified_evidence() {
     let mut senders = Vec::new();
     while let Ok(LeaderElectionMessage::Record {
         input: Input::EvidenceReceived { from },
-    }) = told.try_recv()
+    }) = messages.try_recv()
     {
         senders.push(from.to_string());
     }

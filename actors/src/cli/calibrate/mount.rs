@@ -184,7 +184,7 @@ impl MountArguments {
     }
 
     /// Prints the mount to paste into a configuration, and writes it there if requested.
-    fn tell(&self, estimate: &MountEstimate, lens: &Lens) -> Result<(), Failure> {
+    fn report_mount(&self, estimate: &MountEstimate, lens: &Lens) -> Result<(), Failure> {
         print(&mount_table(estimate, self.camera.is_some()).context("the mount as TOML")?)?;
         if let Some([near_m, far_m]) = estimate.mount.ground_in_view(&lens.intrinsics) {
             let far = if far_m.is_finite() {
@@ -297,7 +297,7 @@ impl PointsArguments {
             };
             eprintln!("point {column},{row}: off by {error_px:.1} px, {on_ground}{outlier}");
         }
-        self.node.tell(
+        self.node.report_mount(
             &fit.estimate,
             &lens.of_frames(picture).map_err(Failure::usage)?,
         )
@@ -358,7 +358,7 @@ impl GroundBoardArguments {
             "{} corners of the board, off by {worst_px:.2} px at most",
             used.count()
         );
-        self.node.tell(
+        self.node.report_mount(
             &MountEstimate {
                 mount: camera.mount.placed(&fit.estimate.mount),
                 ..fit.estimate
@@ -414,7 +414,7 @@ impl PeopleArguments {
         let estimate = watched
             .fit()
             .with_context(|| format!("{:?} gives no mount{seen}", self.label))?;
-        self.node.tell(&estimate, watched.lens())
+        self.node.report_mount(&estimate, watched.lens())
     }
 
     /// Detections of the node's detector until the time is up, or the source ends.

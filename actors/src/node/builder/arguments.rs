@@ -87,7 +87,7 @@ impl NodeBuilder {
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
-            looks_on: self.config.looks_on(),
+            only_observes: self.config.only_observes(),
         }
     }
 
@@ -196,29 +196,29 @@ impl NodeBuilder {
                         counters.shed(ShedReason::ObjectsThrottled, node.vehicle().as_str());
                         return;
                     }
-                    !outcome.is_first || fuser.send(FuserMessage::TakeReports)
+                    !outcome.is_first || fuser.send(FuserMessage::HandleReports)
                 }
                 Incoming::Map(map) => {
                     let map = Arc::clone(map);
-                    follower.send(FollowerMessage::TakeMap {
+                    follower.send(FollowerMessage::HandleMap {
                         delivery: delivery.map(|_| map),
                     })
                 }
                 Incoming::Verdicts(verdicts) => {
                     let verdicts = Arc::clone(verdicts);
-                    follower.send(FollowerMessage::TakeVerdicts {
+                    follower.send(FollowerMessage::HandleVerdicts {
                         delivery: delivery.map(|_| verdicts),
                     })
                 }
                 Incoming::Reputations(reputations) => {
                     let reputations = Arc::clone(reputations);
-                    follower.send(FollowerMessage::TakeReputations {
+                    follower.send(FollowerMessage::HandleReputations {
                         delivery: delivery.map(|_| reputations),
                     })
                 }
                 Incoming::Description(body) => {
                     let body = Arc::clone(body);
-                    description.send(DescriptionKeeperMessage::Take {
+                    description.send(DescriptionKeeperMessage::HandleDescription {
                         delivery: delivery.map(|_| body),
                     })
                 }
@@ -256,7 +256,7 @@ impl NodeBuilder {
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
                     let status = Arc::clone(status);
-                    election.send(LeaderElectionMessage::TakeStatus {
+                    election.send(LeaderElectionMessage::HandleStatus {
                         delivery: delivery.map(|_| status),
                     })
                 }

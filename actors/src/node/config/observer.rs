@@ -49,7 +49,7 @@ impl NodeConfig {
 
     /// True if the node only observes: it does not lead or report, and does not accept reports of
     /// local programs.
-    pub fn looks_on(&self) -> bool {
+    pub fn only_observes(&self) -> bool {
         !self.may_lead() && !self.has_camera() && !self.broker.door
     }
 }

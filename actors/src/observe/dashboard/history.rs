@@ -301,16 +301,16 @@ mod tests {
             (history.terms.len(), history.samples.len()),
             (MAX_TERMS, MAX_SAMPLES)
         );
-        let told: serde_json::Value =
+        let samples: serde_json::Value =
             serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
-        let told = told["samples"].as_array().unwrap();
+        let samples = samples["samples"].as_array().unwrap();
         assert_eq!(
-            told.len(),
+            samples.len(),
             2,
             "samples that the browser has are not sent again"
         );
         assert_eq!(
-            (&told[1]["at_us"], &told[1]["rounds"]),
+            (&samples[1]["at_us"], &samples[1]["rounds"]),
             (&999_000_000.into(), &1000.into())
         );
     }

@@ -384,7 +384,7 @@ mod tests {
         assert_eq!(
             live_state.reports_since(Timestamp(5)).len(),
             1,
-            "there is room when old ones are forgotten"
+            "removed entries make room"
         );
     }
 
@@ -539,13 +539,13 @@ mod tests {
         );
         let name = NodeName::from_static("self");
         let edge = NodeName::from_static("edge");
-        let told = live_state.troubles(&name, Some(&edge), own);
-        let told: Vec<_> = told
+        let listed = live_state.troubles(&name, Some(&edge), own);
+        let listed: Vec<_> = listed
             .iter()
             .map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause))
             .collect();
         assert_eq!(
-            told,
+            listed,
             [
                 (None, "z"),
                 (None, "own"),

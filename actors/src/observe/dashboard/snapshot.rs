@@ -311,7 +311,7 @@ mod tests {
         assert_eq!(
             alive(&[member], &up),
             ["euclid", "both"],
-            "what a broker said before it was lost is not its word now"
+            "the state of a lost broker is unknown"
         );
         assert_eq!(alive(&[], &up), ["both"]);
     }

@@ -269,7 +269,7 @@ mod tests {
         all.iter().map(|name| NodeName::from_static(name)).collect()
     }
 
-    fn told(timeline: &Timeline) -> Value {
+    fn parsed(timeline: &Timeline) -> Value {
         serde_json::from_slice(&[b"{", &*timeline.json_since(at(0)), b"}"].concat()).unwrap()
     }
 
@@ -309,8 +309,8 @@ mod tests {
         timeline.nodes(names(&["euclid"]), at(5));
         timeline.reputations(&reputations(0.45, 5), at(5));
         timeline.reputations(&reputations(0.35, 6), at(6));
-        let told = told(&timeline);
-        let told: Vec<_> = told["events"]
+        let parsed = parsed(&timeline);
+        let texts: Vec<_> = parsed["events"]
             .as_array()
             .unwrap()
             .iter()
@@ -323,7 +323,7 @@ mod tests {
             "liar is contradicted by the others: 3 votes right, 12 wrong",
             "edge is gone",
         ];
-        assert_eq!(told, expected.map(Some), "a score that varies is no news");
+        assert_eq!(texts, expected.map(Some), "a score that varies is no news");
     }
 
     /// Ten minutes of a small cell are held second by second, an hour of the largest maps within
@@ -401,8 +401,8 @@ mod tests {
                 .frames
                 .push(at(second), || second.to_string().into_bytes());
         }
-        let told = told(&timeline);
-        let texts: Vec<_> = told["events"]
+        let parsed = parsed(&timeline);
+        let texts: Vec<_> = parsed["events"]
             .as_array()
             .unwrap()
             .iter()
@@ -410,7 +410,7 @@ mod tests {
             .collect();
         assert_eq!(texts, ["50", "51", "100", "101"].map(Some));
         assert_eq!(
-            told["frames"],
+            parsed["frames"],
             serde_json::json!([50_000_000, 51_000_000, 100_000_000, 101_000_000])
         );
         assert_eq!(timeline.frames.json(), b"[50,51,100,101]");

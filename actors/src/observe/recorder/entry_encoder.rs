@@ -463,7 +463,7 @@ mod tests {
         assert_eq!(
             (drawn.len(), drawn.last()),
             (20, Some(&1)),
-            "{drawn:?}: one that left goes"
+            "{drawn:?}: a removed object disappears"
         );
     }
 }

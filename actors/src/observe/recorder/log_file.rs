@@ -167,7 +167,7 @@ mod tests {
         File::create_new(&path).unwrap();
         let refusing = File::open(&path).unwrap();
         assert!(LogFile::begin(&path, refusing, &identity).is_err());
-        assert!(!path.exists(), "the disk took nothing at all");
+        assert!(!path.exists(), "the disk accepted no byte");
 
         let mut file = LogFile::begin(&path, File::create_new(&path).unwrap(), &identity).unwrap();
         file.put(message).unwrap();

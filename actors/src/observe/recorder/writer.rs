@@ -419,7 +419,7 @@ mod tests {
             .filter(|message| message.schema == SchemaName::JournalEntry);
         let events =
             journal.map(|message| serde_json::from_slice::<JournalEntry>(&message.json).unwrap());
-        let told: Vec<_> = events
+        let listed: Vec<_> = events
             .map(|JournalEntry { at_us, event }| match event {
                 JournalEvent::Command(Command::Configure { landmarks, .. }) => {
                     (at_us.0 / 1_000_000, landmarks[0].id.to_string())
@@ -430,12 +430,12 @@ mod tests {
                 _ => (at_us.0 / 1_000_000, "tick".into()),
             })
             .collect();
-        let told: Vec<_> = told
+        let listed: Vec<_> = listed
             .iter()
             .map(|(at, event)| (*at, event.as_str()))
             .collect();
         assert_eq!(
-            told,
+            listed,
             [
                 (1, "2 missing"),
                 (1, "tick"),

@@ -241,7 +241,7 @@ mod tests {
             .count();
         assert_eq!(cut, 12);
         assert!(!is_cut(&mut slots[0].1), "it came last");
-        assert!(!is_cut(&mut empty_cut), "it holds nothing");
+        assert!(!is_cut(&mut empty_cut), "the backlog is empty");
     }
 
     #[test]

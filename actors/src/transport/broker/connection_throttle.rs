@@ -349,7 +349,7 @@ mod tests {
         let latest = ClientOrigin::Remote(IpAddr::V4(u32::MAX.into()));
         assert!(
             throttle.admit(latest, at(60_000)).is_some(),
-            "the old are forgotten"
+            "old addresses are removed"
         );
         let sources = throttle.table();
         assert_eq!((sources.by_address.len(), sources.pending.len()), (1, 0));

@@ -136,7 +136,7 @@ mod tests {
         assert_eq!(taken(&authority, 3), std::slice::from_ref(&gauss));
         assert_eq!(taken(&authority, 3), []);
         departures.record(gauss.clone(), certificates[0].clone(), at(4));
-        assert_eq!(taken(&authority, 65), [], "nothing of it is left");
+        assert_eq!(taken(&authority, 65), [], "all its entries are removed");
         for number in 0..=MAX_CLIENTS {
             let name = NodeName::new(format!("v{number}")).unwrap();
             certificates.swap(0, 1);

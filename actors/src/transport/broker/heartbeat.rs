@@ -67,7 +67,7 @@ mod tests {
         assert_eq!(
             after(200_000, lost_at(200_000, 60_000)),
             Some(26 * 60_000),
-            "a stopped process looks at nothing"
+            "a stopped process checks no heartbeat"
         );
     }
 }

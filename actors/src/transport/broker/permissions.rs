@@ -400,12 +400,12 @@ mod tests {
         }
         assert!(
             !allows(&euclid, "ledger/euclid--2"),
-            "parts see, and lead nothing"
+            "parts read and do not lead"
         );
         let vehicle = identity("euclid", Role::Cav);
         assert!(
             allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),
-            "it never counts votes"
+            "it does not count votes"
         );
         for topic in ["global_detections", "global_verdicts", "reputations"] {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");

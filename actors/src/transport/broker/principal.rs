@@ -303,7 +303,7 @@ mod tests {
         assert_eq!(
             quota.connections.lock().unwrap().len(),
             1,
-            "who has left is forgotten"
+            "a client that left is removed"
         );
     }
 
@@ -338,7 +338,7 @@ mod tests {
         assert_ne!(
             quota_key(4),
             quota_key(5),
-            "this machine's are told apart by their names"
+            "clients of this machine are distinguished by name"
         );
         assert_eq!(
             quota_key(6),

@@ -95,7 +95,7 @@ mod tests {
         assert_eq!(
             window.accept(u64::MAX),
             Err(FrameEvent::Replayed),
-            "nothing goes back"
+            "the window does not move back"
         );
     }
 

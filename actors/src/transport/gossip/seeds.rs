@@ -98,7 +98,7 @@ mod tests {
         assert_eq!(
             known.into_values().flatten().collect::<Vec<_>>(),
             [usual, before],
-            "what was known once stays"
+            "resolved addresses stay"
         );
         assert_eq!(
             unresolved,

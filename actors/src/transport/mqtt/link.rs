@@ -19,7 +19,7 @@ use uuid::Uuid;
 
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
-use super::hearing::Hearing;
+use super::packet_counter::PacketCounter;
 use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use super::security::Security;
 use crate::platform::clock;
@@ -81,7 +81,7 @@ pub(crate) struct Link {
     pub(crate) client: Option<Client>,
     /// The node whose certificate the broker has proven in the last handshake.
     pub(crate) node: Option<NodeName>,
-    hearing: Arc<Hearing>,
+    packets: Arc<PacketCounter>,
     echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
@@ -97,19 +97,19 @@ impl Link {
         report: LinkSink,
     ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
-        let hearing = Arc::<Hearing>::default();
+        let packets = Arc::<PacketCounter>::default();
         let at = broker.clone();
         let task = LinkTask {
             id,
             broker: at,
             setup,
             report,
-            hearing,
+            packets,
             reported_refusal: None,
             has_reported_oversized: false,
             has_reported_clock: false,
         };
-        let hearing = Arc::clone(&task.hearing);
+        let packets = Arc::clone(&task.packets);
         let task = tokio::spawn(task.run(backoff));
         let abort = task.abort_handle();
         let echo = EchoMonitor::default();
@@ -118,7 +118,7 @@ impl Link {
             state: LinkState::Down,
             client: None,
             node: None,
-            hearing,
+            packets,
             echo,
             abort,
             task: Some(task),
@@ -135,9 +135,9 @@ impl Link {
     /// Records a message whose echo is expected, even if there was no room to send it; true if the
     /// broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
-        let is_stalled = self.echo.record_sent(self.hearing.packets(), now);
+        let is_stalled = self.echo.record_sent(self.packets.count(), now);
         if is_stalled {
-            self.hearing.miss();
+            self.packets.notify_next();
         }
         is_stalled
     }
@@ -177,7 +177,7 @@ struct LinkTask {
     broker: BrokerAddress,
     setup: Arc<LinkSetup>,
     report: LinkSink,
-    hearing: Arc<Hearing>,
+    packets: Arc<PacketCounter>,
     /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
@@ -287,7 +287,7 @@ impl LinkTask {
             .inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         let node = identity.and_then(|identity| identity.node());
-        self.hearing.record();
+        self.packets.record();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
         counters
             .troubles()
@@ -318,7 +318,7 @@ impl LinkTask {
                 continue;
             }
             silent = Duration::ZERO;
-            if self.hearing.record() {
+            if self.packets.record() {
                 self.report_change(LinkChange::Answered);
             }
             match packet {

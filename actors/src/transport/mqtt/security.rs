@@ -362,8 +362,8 @@ mod tests {
             role: Role::Auto,
             certificate: Some(certificate),
         };
-        let (members, told) = watch::channel(vec![member]);
-        let receiver = of_euclid.clone().with_members(told);
+        let (members, updates) = watch::channel(vec![member]);
+        let receiver = of_euclid.clone().with_members(updates);
         let topic = "ecod/v1/lot/global_detections";
         let payload = br#"{"schema":1,"round":7}"#.to_vec();
         let signed = of_edge.sign_round(topic, payload.clone());

@@ -600,7 +600,7 @@ mod tests {
         let observer = Credentials::load(&files, &NodeName::from_static("euclid--top")).unwrap();
         assert!(
             observer.check_rights(Role::Auto, 0).is_err(),
-            "an observer never leads"
+            "an observer does not lead"
         );
     }
 }

@@ -45,7 +45,7 @@ async fn shown(cell: &Cell, program: &Program, name: &str, viewer: &str, contrib
     };
     tokio::time::timeout(PATIENCE, shown)
         .await
-        .unwrap_or_else(|_| panic!("the boxes of {name} are never on the map"));
+        .unwrap_or_else(|_| panic!("the boxes of {name} are not on the map"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -64,7 +64,7 @@ async fn certified_vehicle_reports_without_node() {
     cell.start("edge", ecod::wire::Role::Edge, |_| ()).await;
     cell.start("euclid", ecod::wire::Role::Cav, |_| ()).await;
     cell.served_by("edge").await;
-    let vehicle = cell.program_with("yolo", ("edge", "euclid"), &[]).await;
+    let vehicle = cell.program_with("yolo", "edge", "euclid", &[]).await;
     shown(&cell, &vehicle, "euclid--yolo", "edge", "euclid").await;
     let payload = boxes("edge", 1).to_string().into_bytes();
     let (reason, text) = vehicle.ask("boxes/edge", payload).await;

@@ -147,14 +147,15 @@ impl Cell {
 
     /// A program at a node's door, with the node's certificate if there are any.
     pub(crate) async fn program(&self, id: &str, node: &str, filters: &[&str]) -> Program {
-        self.program_with(id, (node, node), filters).await
+        self.program_with(id, node, node, filters).await
     }
 
     /// A program at one node's door, with the certificate of another.
     pub(crate) async fn program_with(
         &self,
         id: &str,
-        (door, owner): (&str, &str),
+        door: &str,
+        owner: &str,
         filters: &[&str],
     ) -> Program {
         let door = self.door(door);

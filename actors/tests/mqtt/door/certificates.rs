@@ -47,7 +47,7 @@ async fn foreign_certificate_cannot_publish() {
         cell.start(name, role, |_| ()).await;
     }
     cell.served_by("edge").await;
-    let stranger = cell.program_with("mallory", ("euclid", "gauss"), &[]).await;
+    let stranger = cell.program_with("mallory", "euclid", "gauss", &[]).await;
     for name in ["euclid--lidar", "gauss--lidar", "gauss"] {
         let (reason, text) = stranger
             .ask(&format!("detections/{name}"), b"{}".to_vec())

@@ -227,12 +227,12 @@ async fn nodeless_vehicle_leaves_last_will() {
     for topic in ["nodes/edge", "global_detections", "detections/edge"] {
         assert!(!login("gauss", topic).await, "{topic}");
     }
-    let told = async {
+    let published = async {
         while watcher.received_on("nodes/euclid").is_empty() {
             sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, told).await.unwrap();
+    timeout(PATIENCE, published).await.unwrap();
     cell.stop().await;
 }
 
@@ -267,12 +267,12 @@ async fn endless_names_leave_status_room() {
         let (_client, mut events) = AsyncClient::new(options, 4);
         assert!(events.poll().await.is_ok(), "{name}");
     }
-    let told = async {
+    let published = async {
         while watcher.received_on("nodes/x7").is_empty() {
             sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, told).await.unwrap();
+    timeout(PATIENCE, published).await.unwrap();
     assert!(
         watcher.received_on("nodes/x999").is_empty(),
         "a last will beyond the room"

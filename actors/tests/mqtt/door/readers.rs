@@ -64,7 +64,7 @@ async fn slow_programs_cost_bounded_memory() {
     );
     let grown = node.memory_kib("VmHWM:").saturating_sub(before);
     println!(
-        "{READERS} programs that never read, {MEGABYTES} MB for each: {grown} KiB more at most"
+        "{READERS} programs that do not read, {MEGABYTES} MB for each: {grown} KiB more at most"
     );
     assert!(grown < MAX_GROWN_KIB, "{grown} KiB");
     drop(readers);

@@ -134,7 +134,7 @@ async fn page_works_like_any_program() {
         if is_at_east(cell.node("edge"), 3.1, "edge") {
             break;
         }
-        assert!(seq < 400, "the report never came to the map");
+        assert!(seq < 400, "the report is not on the map");
     }
     receive(&mut page, br#""contributors":["edge"]"#).await;
     // The rights are equal, too.

@@ -5,9 +5,8 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use ecod_actors::actors::broker::Broker;
 use ecod_actors::messages::broker::BrokerMessage;
 use ecod_actors::transport::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker};
+use ecod_testkit::until;
 use ractor::{Actor, call};
-
-use crate::gateway::cell::until;
 
 #[tokio::test]
 async fn busy_port_is_reported() {

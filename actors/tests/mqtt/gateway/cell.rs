@@ -91,7 +91,7 @@ impl Node {
             counters: Arc::clone(&counters),
             subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
             seed: 7,
-            looks_on: false,
+            only_observes: false,
         };
         let (gateway, handle) = Actor::spawn(None, Gateway, arguments).await.unwrap();
         Self {
@@ -180,18 +180,6 @@ pub(crate) async fn edge_and_vehicle(broker: &BrokerAddress, mqtt: MqttConfig) -
     let edge = Node::join("edge", SubscriptionRole::Candidate, mqtt.clone(), &[broker]).await;
     let euclid = Node::join("euclid", SubscriptionRole::Follower, mqtt, &[broker]).await;
     (edge, euclid)
-}
-
-/// Waits until `reached` without a fixed sleep.
-pub(crate) async fn until(what: &str, reached: impl Fn() -> bool) {
-    let reached = async {
-        while !reached() {
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, reached)
-        .await
-        .unwrap_or_else(|_| panic!("never reached: {what}"));
 }
 
 /// A plain client without ECOD's code.

@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use ecod::wire::{Encoding, RejectReason, encode};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::transport::mqtt::{LinkState, MqttConfig, MqttVersion};
+use ecod_testkit::until;
 
-use crate::gateway::cell::{Stranger, edge_and_vehicle, embedded, name, report, topic, until};
+use crate::gateway::cell::{Stranger, edge_and_vehicle, embedded, name, report, topic};
 use crate::mosquitto::Mosquitto;
 
 fn objects(count: usize) -> String {

@@ -7,9 +7,10 @@ use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{BrokerAddress, Incoming, MqttConfig, SubscriptionRole};
+use ecod_testkit::until;
 
 use crate::gateway::cell::{
-    LOOPBACK, Node, Stranger, edge_and_vehicle, embedded, map, name, topic, until,
+    LOOPBACK, Node, Stranger, edge_and_vehicle, embedded, map, name, topic,
 };
 
 /// A map in which four vehicles contribute to every landmark.

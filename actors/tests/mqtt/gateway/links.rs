@@ -10,9 +10,10 @@ use ecod_actors::transport::broker::MqttBroker;
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, SubscriptionRole,
 };
+use ecod_testkit::until;
 use tokio::task::JoinHandle;
 
-use crate::gateway::cell::{LOOPBACK, Node, edge_and_vehicle, embedded, map, name, until};
+use crate::gateway::cell::{LOOPBACK, Node, edge_and_vehicle, embedded, map, name};
 use crate::mosquitto::Mosquitto;
 
 async fn report_and_map_pass(broker: &BrokerAddress, mqtt: MqttConfig) {

@@ -7,8 +7,9 @@ use ecod_actors::transport::broker::MqttBroker;
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Incoming, LinkState, MqttConfig, MqttVersion, SubscriptionRole,
 };
+use ecod_testkit::until;
 
-use crate::gateway::cell::{LOOPBACK, Node, Stranger, embedded, topic, until};
+use crate::gateway::cell::{LOOPBACK, Node, Stranger, embedded, topic};
 use crate::mosquitto::Mosquitto;
 
 async fn latecomers_see_the_living_and_the_dead(broker: &BrokerAddress, version: MqttVersion) {

@@ -1,7 +1,5 @@
 //! Cells of one node with an uplink.
 
-use std::time::Duration;
-
 use ecod::aggregator::Algorithms;
 use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{Role, Trouble};
@@ -9,9 +7,6 @@ use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
 use ecod_actors::transport::mqtt::BrokerAddress;
 use ecod_testkit::node_config;
-
-/// Maximum time for anything.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// The place of the first cell; others are some metres from it.
 pub(crate) const ORIGIN: GeographicOrigin = GeographicOrigin {
@@ -52,16 +47,4 @@ pub(crate) fn trouble(node: &NodeHandle, kind: &str) -> Option<Trouble> {
         .present()
         .into_iter()
         .find(|trouble| trouble.kind == kind)
-}
-
-/// Lets time pass until it holds.
-pub(crate) async fn until(what: &str, holds: impl AsyncFn() -> bool) {
-    let reached = async {
-        while !holds().await {
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, reached)
-        .await
-        .unwrap_or_else(|_| panic!("not within {PATIENCE:?}: {what}"));
 }

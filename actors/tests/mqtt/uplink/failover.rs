@@ -9,8 +9,9 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellMap, NodeState, Role};
 use ecod_actors::messages::newest::ReceivedMap;
+use ecod_testkit::until_async as until;
 
-use crate::uplink::cell::{config, until};
+use crate::uplink::cell::config;
 use crate::uplink::region::{Broker, Subscriber, in_order, longest_gap};
 
 /// A node as a process; killed when dropped.

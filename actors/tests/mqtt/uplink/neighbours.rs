@@ -15,8 +15,9 @@ use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 
-use crate::uplink::cell::{ORIGIN, config, round, start, until};
+use crate::uplink::cell::{ORIGIN, config, round, start};
 use crate::uplink::region::{Broker, Subscriber};
 
 /// The origin so many metres north of the first cell's.

@@ -7,9 +7,10 @@ use ecod::neighbours::{CellMapFilter, MAX_AGE};
 use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
+use ecod_testkit::until_async as until;
 
 use crate::mosquitto::Mosquitto;
-use crate::uplink::cell::{config, round, start, trouble, until};
+use crate::uplink::cell::{config, round, start, trouble};
 use crate::uplink::region::{Broker, Subscriber, assert_in_order};
 
 /// Without its region the cell continues as before and reports the trouble; no part waits for the region's return.

@@ -10,9 +10,10 @@ use ecod_actors::platform::clock;
 use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::pki::{Authority, TlsConfig};
+use ecod_testkit::until_async as until;
 
 use crate::mosquitto::Mosquitto;
-use crate::uplink::cell::{config, round, start, trouble, until};
+use crate::uplink::cell::{config, round, start, trouble};
 use crate::uplink::region::{Broker, Subscriber};
 
 /// A wrong password is reported as such, with the broker's address, and does not affect the cell.

@@ -112,7 +112,7 @@ async fn flood(target: Target) -> anyhow::Result<()> {
         &format!("ecod/v1/{CELL}/global_detections"),
         &vec![b'x'; 8_000_000],
     );
-    join_all((0..30).map(|_| send_for_ever(&target, (&target.candidate, CANDIDATE), &[], &map)))
+    join_all((0..30).map(|_| send_for_ever(&target, &target.candidate, CANDIDATE, &[], &map)))
         .await;
     Ok(())
 }
@@ -120,7 +120,8 @@ async fn flood(target: Target) -> anyhow::Result<()> {
 pub(crate) async fn join(target: &Target, role: Role) -> anyhow::Result<Insider> {
     Insider::join(
         target,
-        (CANDIDATE, role),
+        CANDIDATE,
+        role,
         Some(Arc::clone(&target.credentials)),
     )
     .await?

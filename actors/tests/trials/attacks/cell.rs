@@ -326,8 +326,8 @@ impl Cell {
             } else {
                 0
             },
-            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count()
-                + self.believers(means)?,
+            accepted_falsehoods: maps.iter().filter(|line| !line.map.is_true()).count()
+                + self.nodes_with_false_evidence(means)?,
             ended,
             deeds: 0,
             fault: None,
@@ -340,8 +340,8 @@ impl Cell {
     }
 
     /// Number of honest nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
-    fn believers(&self, means: Means) -> anyhow::Result<usize> {
-        let mut believers = 0;
+    fn nodes_with_false_evidence(&self, means: Means) -> anyhow::Result<usize> {
+        let mut count = 0;
         for node in self
             .nodes
             .iter()
@@ -352,9 +352,9 @@ impl Cell {
                 .map(|file| Ok(fs::read(file?.path())?))
                 .collect::<anyhow::Result<Vec<_>>>()?;
             let is_forged = |state: &Vec<u8>| state.windows(6).any(|text| text == b"\"liar\"");
-            believers += usize::from(states.iter().any(is_forged));
+            count += usize::from(states.iter().any(is_forged));
         }
-        Ok(believers)
+        Ok(count)
     }
 
     fn ended(&mut self) -> anyhow::Result<Vec<String>> {

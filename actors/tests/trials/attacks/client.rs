@@ -76,7 +76,8 @@ pub(crate) async fn log_in_as(
 /// Sends the opening once and the packet for ever, over a new connection whenever one ends.
 pub(crate) async fn send_for_ever(
     target: &Target,
-    (tls, name): (&Arc<ClientConfig>, &str),
+    tls: &Arc<ClientConfig>,
+    name: &str,
     opening: &[u8],
     packet: &[u8],
 ) {

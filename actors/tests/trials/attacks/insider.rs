@@ -42,7 +42,8 @@ impl Insider {
     /// Greets all nodes with the cell's key, and with a certificate if one is given.
     pub(crate) async fn join(
         target: &Target,
-        (name, role): (&'static str, Role),
+        name: &'static str,
+        role: Role,
         credentials: Option<Arc<Credentials>>,
     ) -> anyhow::Result<Self> {
         let mut config = MembershipConfig {

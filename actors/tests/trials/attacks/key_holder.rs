@@ -46,7 +46,7 @@ pub(crate) const ROWS: &[Row] = &[
 pub(crate) const NAME: &str = "mallory";
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
-    let insider = Insider::join(&target, (NAME, Role::Cav), None).await?;
+    let insider = Insider::join(&target, NAME, Role::Cav, None).await?;
     tokio::try_join!(
         insider.repeat(
             MAX_TERM,
@@ -62,12 +62,8 @@ async fn largest_term(target: Target) -> anyhow::Result<()> {
 }
 
 async fn claims(target: Target) -> anyhow::Result<()> {
-    let insider = Insider::join(
-        &target,
-        (NAME, Role::Edge),
-        Some(Arc::clone(&target.foreign)),
-    )
-    .await?;
+    let insider =
+        Insider::join(&target, NAME, Role::Edge, Some(Arc::clone(&target.foreign))).await?;
     let beat = Body::Beat {
         every_ms: 50,
         round: 1,
@@ -109,7 +105,8 @@ async fn largest_counter(target: Target) -> anyhow::Result<()> {
     let greet = async {
         let insider = Insider::join(
             &through,
-            (NAME, Role::Edge),
+            NAME,
+            Role::Edge,
             Some(Arc::clone(&target.foreign)),
         )
         .await?;

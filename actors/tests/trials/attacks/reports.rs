@@ -157,7 +157,7 @@ async fn report_in_name(
 /// Reports an object that no other node sees. Fails if a map has it later than [`GONE_WITHIN`] after the revocation.
 async fn report_until_revoked(target: Target) -> anyhow::Result<()> {
     let credentials = Arc::clone(&target.vehicles[0]);
-    let _member = Insider::join(&target, (VEHICLE, Role::Cav), Some(credentials)).await?;
+    let _member = Insider::join(&target, VEHICLE, Role::Cav, Some(credentials)).await?;
     let invent = report_for_ever(target.clone(), 1, Duration::from_millis(100), |_| {
         vec![PerceivedObject::new("person", 0.9, 40.0, 40.0)]
     });

@@ -93,7 +93,7 @@ pub(crate) struct Outcome {
     pub(crate) is_replaced: bool,
     /// Maps with objects that no honest vehicle has detected, or that no node of the cell made, and nodes that keep
     /// forged evidence.
-    pub(crate) believed_lies: usize,
+    pub(crate) accepted_falsehoods: usize,
     /// Nodes that ended.
     pub(crate) ended: Vec<String>,
     /// Deeds of the attacker, and the reason for which the attack ended early.
@@ -128,7 +128,7 @@ impl Bar {
             && self
                 .is_replaced
                 .is_none_or(|is_replaced| outcome.is_replaced == is_replaced)
-            && outcome.believed_lies == 0
+            && outcome.accepted_falsehoods == 0
             && outcome.ended.is_empty()
     }
 }
@@ -165,8 +165,12 @@ impl fmt::Display for Outcome {
         self.fault
             .iter()
             .try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
-        if self.believed_lies > 0 {
-            write!(f, ", {} lies believed", self.believed_lies)?;
+        if self.accepted_falsehoods > 0 {
+            write!(
+                f,
+                ", {} false statements accepted",
+                self.accepted_falsehoods
+            )?;
         }
         if self.is_replaced {
             write!(f, ", another leader")?;
@@ -187,11 +191,11 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
         .unwrap_or_default();
     let mut text = format!(
         "{:width$}  {:16}  {:7}  {:22}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
-        "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "lies", "bar"
+        "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "false", "bar"
     );
     for (row, victim, outcome) in lines {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
-        let lies = outcome.believed_lies;
+        let falsehoods = outcome.accepted_falsehoods;
         let verdict = if !row.took_place(outcome) {
             outcome.fault.as_ref().map_or_else(
                 || "NOT ATTACKED: too few deeds".to_owned(),
@@ -213,7 +217,7 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
         let at = victim.name();
         let _ = writeln!(
             text,
-            "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {lies:>5}  {:27}  {verdict}",
+            "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {falsehoods:>5}  {:27}  {verdict}",
             row.bar.to_string()
         );
     }

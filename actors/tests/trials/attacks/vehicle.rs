@@ -143,7 +143,7 @@ async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
         } else {
             &[]
         };
-        send_for_ever(&target, (&target.vehicle, VEHICLE), opening, &reading[1])
+        send_for_ever(&target, &target.vehicle, VEHICLE, opening, &reading[1])
     };
     join_all((0..CONNECTIONS).map(connection)).await;
     Ok(())
@@ -320,7 +320,7 @@ async fn no_login(target: Target, at: &'static [&'static str]) -> anyhow::Result
         let target = target.clone();
         let credentials = Arc::clone(credentials);
         async move {
-            let insider = Insider::join(&target, (name, Role::Cav), Some(credentials)).await?;
+            let insider = Insider::join(&target, name, Role::Cav, Some(credentials)).await?;
             let no_login = at.iter().copied().map(NodeName::from_static).collect();
             let followed = Epoch::new(1, NodeName::from_static(LEADER));
             insider

@@ -61,7 +61,7 @@ impl Voters {
                 }
             }),
             seed: 1,
-            looks_on: false,
+            only_observes: false,
         };
         let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers {
@@ -123,9 +123,9 @@ impl Drop for Voters {
 }
 
 fn is_unmasked(reputations: &Reputations) -> bool {
-    let told = |node| reputations.reputations.get(&NodeName::from_static(node));
-    told("liar").is_some_and(|liar| liar.incorrect > 0)
-        && told("euclid").is_some_and(|euclid| euclid.correct > 0)
+    let reputation_of = |node| reputations.reputations.get(&NodeName::from_static(node));
+    reputation_of("liar").is_some_and(|liar| liar.incorrect > 0)
+        && reputation_of("euclid").is_some_and(|euclid| euclid.correct > 0)
 }
 
 fn keep(newest: &mut Option<Arc<Reputations>>, reputations: Arc<Reputations>) {

@@ -5,9 +5,10 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use ecod_testkit::{all_output, until_blocking as until};
 use tempfile::TempDir;
 
-use crate::joining::{Running, said, tokens, until};
+use crate::joining::{Running, tokens};
 use crate::network::{Bridged, namespace};
 
 /// Stands for systemd, which namespaces lack: a service runs by the command of its unit, and is noted as enabled.
@@ -109,16 +110,16 @@ impl Machine {
 
     fn run(&self, line: &str) -> String {
         let output = self.command(line).output().unwrap();
-        assert!(output.status.success(), "{line}: {}", said(&output));
-        said(&output)
+        assert!(output.status.success(), "{line}: {}", all_output(&output));
+        all_output(&output)
     }
 
     /// Starts the node by the command that `init` or `join` printed.
-    fn start(&self, told: &str) -> Running {
-        let line = told
+    fn start(&self, instructions: &str) -> Running {
+        let line = instructions
             .split_once("start it: ")
             .and_then(|(_, rest)| rest.lines().next())
-            .expect(told);
+            .expect(instructions);
         let log = File::create(self.files.path().join("log")).unwrap();
         let mut command = self.command(line);
         command.arg("--map-log").arg(self.maps());
@@ -205,10 +206,11 @@ fn readme_commands_form_cell() {
     );
     let tokens = tokens(&mut host, 2);
     for (machine, token) in [euclid, gauss].into_iter().zip(&tokens) {
-        let told = machine.run(&join.replace("TOKEN", token));
+        let instructions = machine.run(&join.replace("TOKEN", token));
         assert!(
-            told.contains("the service ecod-node is enabled and runs") && machine.is_enabled(),
-            "{told}"
+            instructions.contains("the service ecod-node is enabled and runs")
+                && machine.is_enabled(),
+            "{instructions}"
         );
     }
     assert!(host.0.wait().unwrap().success(), "all have joined");

@@ -63,12 +63,12 @@ fn scores_outside_probability_are_refused() {
         results.resize(hypotheses, results[0].clone());
         results.last_mut().unwrap().hypothesis.score = score;
         let (frame, refused) = camera().place(&message, None).unwrap();
-        let told: Vec<_> = refused
+        let reported: Vec<_> = refused
             .iter()
             .map(|refused| (refused.refusal, refused.detail.as_str()))
             .collect();
         assert_eq!(
-            (frame.objects.len(), told),
+            (frame.objects.len(), reported),
             (
                 0,
                 vec![(InputRefusal::Score, format!(": {score} of \"2\"").as_str())]
@@ -110,7 +110,7 @@ fn position_is_frame_independent() {
     assert_eq!(
         (before.heading_rad, before.size_m),
         (None, Some([4.2, 1.8])),
-        "not turned: nothing is known"
+        "not turned: the orientation is unknown"
     );
     assert_eq!((optical.heading_rad, optical.size_m), (None, None));
 }
@@ -168,7 +168,7 @@ fn tilted_camera_places_objects_nearer() {
         (object.y_m - 1.0 - 10.0 * 0.5f64.cos()).abs() < 1e-9 && (object.x_m - 5.0).abs() < 1e-9,
         "{object:?}"
     );
-    assert_eq!(object.covariance_m2, None, "zeros state nothing");
+    assert_eq!(object.covariance_m2, None, "zeros mean unknown");
 }
 
 #[test]

@@ -69,7 +69,7 @@ fn kitti_objects_use_vehicle_frame() {
             (0, Some(3), "Car", 1.0, 13.4, 4.5),
             (2, Some(3), "Car", 0.7, 14.0, 4.0)
         ],
-        "left is positive, and classes that are not judged are left out"
+        "left is positive, and classes that are not judged are omitted"
     );
 }
 

@@ -178,7 +178,7 @@ fn rediscovered_object_is_fragment() {
     assert_eq!(
         (switched.fragments, switched.id_switches),
         (0, 1),
-        "it was never missed"
+        "the object is always tracked"
     );
 }
 

@@ -349,7 +349,7 @@ mod tests {
         assert_eq!(
             [place(0, 75), place(1, 250)],
             [1.0, 3.0],
-            "nothing is known beyond the ends"
+            "beyond the ends the truth is unknown"
         );
     }
 

@@ -158,19 +158,19 @@ fn people_give_pitch_and_height() {
                         .collect()
                 })
                 .collect();
-            let told = format!("{height_m} m, {pitch_deg}°, {roll_deg}°, {boxes} boxes");
+            let case = format!("{height_m} m, {pitch_deg}°, {roll_deg}°, {boxes} boxes");
             let found = fit_mount(&frames, &size, 3.0, &optics(), &Mount::default());
             let MountEstimate { mount, .. } =
-                found.unwrap_or_else(|error| panic!("{told}: {error}"));
+                found.unwrap_or_else(|error| panic!("{case}: {error}"));
             let pitch_off_deg = mount.pitch_rad.to_degrees() - pitch_deg;
             let height_off = mount.height_m.unwrap() / height_m - 1.0;
-            let told = format!(
-                "{told}: pitch {pitch_off_deg:+.2}°, height {:+.1} %",
+            let case = format!(
+                "{case}: pitch {pitch_off_deg:+.2}°, height {:+.1} %",
                 100.0 * height_off
             );
-            println!("{told}");
+            println!("{case}");
             if pitch_off_deg.abs() > 1.0 || height_off.abs() > 0.08 {
-                failures.push(told);
+                failures.push(case);
             }
         }
     }

@@ -505,7 +505,7 @@ fn tilted_camera_ranges_objects_and_corners() {
 
 /// The angle found from a minute of the street, with a box each half second, for a camera that is
 /// mounted differently than stated.
-fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
+fn measured_turn_rad(mounted: &Mount, said: Mount) -> Option<f64> {
     let mut street = Street::new(said.height_m.unwrap());
     let projection = projection(
         Ranging::Auto,
@@ -516,18 +516,18 @@ fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
         },
     );
     let mut check = MountCheck::default();
-    let mut told = None;
+    let mut found_rad = None;
     for half_seconds in 0..120 {
         let (mut detection, _) = street.next(mounted, 1.0, 10.0);
         detection.bounding_box.y_max += 2.0 * street.normal();
         let boxes = [(&detection, projection.cut(&detection))];
-        told = check.add(
+        found_rad = check.add(
             boxes,
             Timestamp::default() + Duration::from_millis(500 * half_seconds),
             &projection,
         );
     }
-    told
+    found_rad
 }
 
 #[test]
@@ -535,7 +535,7 @@ fn turned_camera_is_detected() {
     for (height_m, pitch_deg) in [(1.2, 0.0), (1.2, 10.0), (2.5, 10.0), (6.0, 20.0)] {
         let said = mount(height_m, pitch_deg, 0.0);
         for turned_deg in [-8.0, -5.0, 5.0, 8.0] {
-            let off_rad = told_rad(&mount(height_m, pitch_deg - turned_deg, 0.0), said);
+            let off_rad = measured_turn_rad(&mount(height_m, pitch_deg - turned_deg, 0.0), said);
             let off_deg = off_rad.map(f64::to_degrees);
             assert!(
                 off_deg.is_some_and(|off_deg| (off_deg - turned_deg).abs() < 1.0),
@@ -543,7 +543,7 @@ fn turned_camera_is_detected() {
             );
         }
         for turned_deg in [-1.5, 0.0, 1.5] {
-            let off_rad = told_rad(&mount(height_m, pitch_deg - turned_deg, 1.5), said);
+            let off_rad = measured_turn_rad(&mount(height_m, pitch_deg - turned_deg, 1.5), said);
             assert_eq!(
                 off_rad, None,
                 "{height_m} m, {pitch_deg}° turned by {turned_deg}°"
@@ -558,7 +558,7 @@ fn turned_camera_is_detected_in_crowd() {
     let said = mount(1.5, 0.0, 0.0);
     let mut street = Street::new(1.5);
     let mut check = MountCheck::default();
-    let mut told = None;
+    let mut found_rad = None;
     let projection = projection(Ranging::Auto, said, &ProjectionConfig::default());
     for half_seconds in 0..40 {
         let crowd: Vec<_> = (0..20)
@@ -567,13 +567,13 @@ fn turned_camera_is_detected_in_crowd() {
         let boxes = crowd
             .iter()
             .map(|detection| (detection, projection.cut(detection)));
-        told = check.add(
+        found_rad = check.add(
             boxes,
             Timestamp::default() + Duration::from_millis(500 * half_seconds),
             &projection,
         );
     }
-    let off_deg = told.map(f64::to_degrees);
+    let off_deg = found_rad.map(f64::to_degrees);
     assert!(
         off_deg.is_some_and(|off_deg| (off_deg - 6.0).abs() < 1.0),
         "{off_deg:?}"
@@ -596,12 +596,12 @@ fn hanging_objects_indicate_no_turn() {
     for seconds in 0..60u32 {
         let at = Point2::new(16.0 + f64::from(seconds % 8), 1.0);
         let hanging = seen("traffic light", &lamp, at, 0.0, &above).unwrap();
-        let told = check.add(
+        let found_rad = check.add(
             [(&hanging, Cut::default())],
             Timestamp::default() + Duration::from_secs(seconds.into()),
             &projection,
         );
-        assert_eq!(told, None);
+        assert_eq!(found_rad, None);
     }
 }
 
@@ -618,12 +618,12 @@ fn raised_objects_indicate_no_turn() {
         ..detection_of("person")
     };
     for seconds in 0..60u32 {
-        let told = check.add(
+        let found_rad = check.add(
             [(&hanging, Cut::default())],
             Timestamp::default() + Duration::from_secs(seconds.into()),
             &projection,
         );
-        assert_eq!(told, None);
+        assert_eq!(found_rad, None);
     }
 }
 

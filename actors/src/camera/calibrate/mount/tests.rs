@@ -160,9 +160,9 @@ fn unsolvable_input_names_remedy() {
         &pose,
         &real,
     );
-    let told = error(&line);
+    let message = error(&line);
     assert!(
-        told.contains("not on one line") || told.contains("no camera"),
-        "{told}"
+        message.contains("not on one line") || message.contains("no camera"),
+        "{message}"
     );
 }

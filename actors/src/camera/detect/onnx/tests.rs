@@ -218,13 +218,13 @@ fn unusable_files_are_named() {
 
 #[test]
 fn input_size_comes_from_model() {
-    let told = refusal(OnnxConfig {
+    let message = refusal(OnnxConfig {
         input_px: Some([96, 64]),
         ..config("yolov8")
     });
     assert!(
-        told.contains("takes images of 64x64, not 96x64: remove `input_px`"),
-        "{told}"
+        message.contains("takes images of 64x64, not 96x64: remove `input_px`"),
+        "{message}"
     );
     // Its grids are for 64x64, in contradiction to its shape.
     let refused = refusal(OnnxConfig {

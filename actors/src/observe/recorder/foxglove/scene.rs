@@ -640,7 +640,7 @@ mod tests {
         } = style.map(&map);
         assert_eq!(
             deletions[0].kind, DELETE_ALL,
-            "what left the map is not shown on"
+            "an object that left the map is not shown"
         );
         assert_eq!(
             entities

@@ -187,7 +187,7 @@ mod tests {
         );
         assert!(
             !clients.iter().any(|client| client == "cron-01"),
-            "the one refused longest ago gives way"
+            "the oldest refusal is evicted"
         );
         let quick = (0..100)
             .filter(|n| shown(&mut refusals, &format!("flood-{n}"), 34).is_some())

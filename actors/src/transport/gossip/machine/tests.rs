@@ -69,14 +69,15 @@ impl Cell {
     }
 
     fn start_at(&mut self, node: usize, name: &str, key: &str, run: u64) {
-        self.start_as(node, name, (key, None), run);
+        self.start_as(node, name, key, None, run);
     }
 
     fn start_as(
         &mut self,
         node: usize,
         name: &str,
-        (key, identity): (&str, Option<Identity>),
+        key: &str,
+        identity: Option<Identity>,
         run: u64,
     ) {
         let own = NodeId {
@@ -139,7 +140,7 @@ impl Cell {
     }
 
     /// Runs while a node sends datagrams to all others ten times a second.
-    fn say_something(&mut self, node: usize, ms: u64) {
+    fn send_beats(&mut self, node: usize, ms: u64) {
         for passed in 0..ms {
             let now = self.now;
             let machine = &mut self.nodes.get_mut(&node).unwrap().machine;
@@ -256,13 +257,13 @@ fn a_node_moves(mut cell: Cell) {
     let moving = cell.nodes.remove(&2).unwrap();
     cell.nodes.insert(12, moving);
     // Its next datagrams come from there already, before it has noticed.
-    cell.say_something(12, 50);
+    cell.send_beats(12, 50);
     let now = cell.now;
     let moved = address(12);
     let node = cell.nodes.get_mut(&12).unwrap();
     node.machine.move_to(moved.ip(), now);
     cell.deliver();
-    cell.say_something(12, 30);
+    cell.send_beats(12, 30);
     for other in [1, 3] {
         let Node {
             machine, events, ..
@@ -281,7 +282,7 @@ fn a_node_moves(mut cell: Cell) {
                 member: member.clone()
             }));
     }
-    cell.say_something(12, 3000);
+    cell.send_beats(12, 3000);
     let is_end = |event: &MembershipEvent| matches!(event, MembershipEvent::Down { .. });
     let mut events = cell.nodes.values().flat_map(|node| &node.events);
     assert!(!events.any(is_end));
@@ -487,7 +488,7 @@ fn second_namesake_gives_up() {
     assert_eq!(
         cell.nodes[&2].machine.members().len(),
         3,
-        "the first one notices nothing else"
+        "the first node reports no other change"
     );
 }
 
@@ -598,7 +599,7 @@ fn datagrams_arrive_with_their_sender() {
     cell.run(10);
     assert!(cell.nodes[&2].events.is_empty());
     let [MembershipEvent::Received { from, payload, .. }] = &cell.nodes[&3].events[..] else {
-        panic!("nothing came")
+        panic!("no message arrived")
     };
     assert_eq!((from, &payload[..]), (&node_name(1), &[42; 1200][..]));
     assert_eq!(
@@ -629,10 +630,10 @@ fn lossy_link_keeps_nodes_connected() {
     let mut given_up = 0;
     for node in cell.nodes.values() {
         given_up += count(node, |event| matches!(event, MembershipEvent::Down { .. }));
-        let heard = count(node, |event| {
+        let received = count(node, |event| {
             matches!(event, MembershipEvent::Received { .. })
         });
-        assert!(heard > 900, "{heard} of 1200");
+        assert!(received > 900, "{received} of 1200");
     }
     assert!(given_up > 2, "{given_up} times: too few to show anything");
 }
@@ -693,8 +694,9 @@ fn silent_seeds_are_named() {
             .set_seeds(seeds.clone());
     }
     let silent = |cell: &Cell, node: usize| -> Vec<String> {
-        let told = cell.nodes[&node].troubles.iter();
-        told.filter(|(_, kind)| *kind == TroubleKind::SeedSilent)
+        let reported = cell.nodes[&node].troubles.iter();
+        reported
+            .filter(|(_, kind)| *kind == TroubleKind::SeedSilent)
             .map(|(about, _)| about.clone())
             .collect()
     };

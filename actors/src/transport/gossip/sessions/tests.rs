@@ -24,11 +24,12 @@ impl End {
     }
 
     fn with(name: &'static str, session: u8, identity: Option<Identity>) -> Self {
-        Self::of_cell(("lot-1", "07"), name, session, identity)
+        Self::of_cell("lot-1", "07", name, session, identity)
     }
 
     fn of_cell(
-        (cell, key): (&'static str, &str),
+        cell: &'static str,
+        key: &str,
         name: &'static str,
         session: u8,
         identity: Option<Identity>,
@@ -151,8 +152,8 @@ fn handshake_opens_session_once() {
         .seal(&b.id.name, FrameKind::Payload, b"hi", NOW)
         .unwrap();
     assert_eq!(to, b.address);
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
     assert_eq!(
         a.open(&frame, b.address, NOW),
@@ -196,8 +197,8 @@ fn huge_counter_blocks_no_frames() {
     }
     assert_eq!(b.sessions.counters.get(FrameEvent::CounterJump), 4);
     let frame = a.seal(&b.id.name, b"hi");
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
 }
 
 #[test]
@@ -216,8 +217,8 @@ fn live_session_resists_takeover() {
     };
     assert_eq!(take_over(&mut b, NOW), Err(FrameEvent::Replayed));
     let frame = a.seal(&b.id.name, b"hi");
-    let heard = payload(&a, b"hi");
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
+    let expected = payload(&a, b"hi");
+    assert_eq!(b.open(&frame, a.address, NOW), Ok(expected));
     let mut mover = End::new("a", 1);
     mover.address = SocketAddr::from(([10, 0, 0, 8], 1));
     mover.id.gossip = mover.address;
@@ -370,14 +371,14 @@ proptest! {
 /// is a typing error away.
 #[test]
 fn other_key_and_typo_reported() {
-    let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
-        let mut node = End::of_cell((own, "07"), "euclid", 1, None);
+    let notices_of = |own: &'static str, other: &'static str, key: &str, is_alone: bool| {
+        let mut node = End::of_cell(own, "07", "euclid", 1, None);
         node.known = (!is_alone).then_some(KnownMember {
             run: 1,
             life: 1,
             alive: true,
         });
-        let mut stranger = End::of_cell(other, "gauss", 7, None);
+        let mut stranger = End::of_cell(other, key, "gauss", 7, None);
         let greeting = stranger.hello();
         let from = stranger.address;
         assert!(node.open(&greeting, from, NOW).is_err());
@@ -388,7 +389,7 @@ fn other_key_and_typo_reported() {
             .collect::<Vec<_>>()
     };
     assert_eq!(
-        heard("lot-1", ("lot-1", "08"), false),
+        notices_of("lot-1", "lot-1", "08", false),
         [(
             TroubleKind::WrongKey,
             "received a datagram of cell lot-1 with another key or none from 10.0.0.7".into()
@@ -398,12 +399,12 @@ fn other_key_and_typo_reported() {
         TroubleKind::OtherCell,
         "received a datagram of cell ux-lott from 10.0.0.7; this node is in ux-lot".into(),
     )];
-    assert_eq!(heard("ux-lot", ("ux-lott", "07"), false), misspelt);
-    assert_eq!(heard("lot-1", ("lot-2", "07"), false), [], "a neighbour");
+    assert_eq!(notices_of("ux-lot", "ux-lott", "07", false), misspelt);
+    assert_eq!(notices_of("lot-1", "lot-2", "07", false), [], "a neighbour");
     assert_eq!(
-        heard("lot-1", ("lot-2", "07"), true).len(),
+        notices_of("lot-1", "lot-2", "07", true).len(),
         1,
         "who is alone may have meant the other"
     );
-    assert_eq!(heard("ux-lot", ("crossing", "07"), true), []);
+    assert_eq!(notices_of("ux-lot", "crossing", "07", true), []);
 }

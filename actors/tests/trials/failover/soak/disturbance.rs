@@ -136,7 +136,7 @@ impl Display for Disturbance {
             Kind::Flood => "5000 reports/s from one vehicle",
             Kind::BadInput => "junk to brokers and membership",
             Kind::Split => "the network is split",
-            Kind::OneWay => "one vehicle does not hear the edge",
+            Kind::OneWay => "one vehicle receives no message of the edge",
             Kind::Loss => "a fifth of all packets is lost",
         };
         write!(f, "{what}, {} s", self.seconds)

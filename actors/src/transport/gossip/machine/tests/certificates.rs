@@ -30,7 +30,7 @@ impl CertifiedCell {
         let identity = self.authority.identity(&name(node), Role::Auto);
         let run = self.cell.now.micros();
         self.cell
-            .start_as(node, &name(node), (KEY, Some(identity)), run);
+            .start_as(node, &name(node), KEY, Some(identity), run);
     }
 
     fn machine(&mut self, node: usize) -> &mut GossipMachine {
@@ -75,7 +75,7 @@ fn certified_namesake_of_seed_gives_up() {
     let run = certified.cell.now.micros();
     certified
         .cell
-        .start_as(9, &name(1), (KEY, Some(identity)), run);
+        .start_as(9, &name(1), KEY, Some(identity), run);
     certified.machine(9).set_seeds(vec![address(1)]);
     certified.cell.run(8000);
     assert_second_gave_up(&certified.cell);
@@ -112,7 +112,7 @@ fn key_alone_admits_no_node() {
     let strange = TestAuthority::new().identity("node-5", Role::Auto);
     certified
         .cell
-        .start_as(5, "node-5", (KEY, Some(strange)), now);
+        .start_as(5, "node-5", KEY, Some(strange), now);
     certified.cell.run(5000);
     for node in 1..=3 {
         assert_eq!(certified.events(node), [], "{node}");
@@ -178,9 +178,7 @@ fn node_with_wrong_clock_waits() {
         ..right.clone()
     };
     let run = certified.cell.now.micros();
-    certified
-        .cell
-        .start_as(3, "node-3", (KEY, Some(wrong)), run);
+    certified.cell.start_as(3, "node-3", KEY, Some(wrong), run);
     certified.cell.run(3000);
     assert!(certified.cell.sees(3).is_empty());
     certified.set_identity(3, right);

@@ -25,15 +25,15 @@ fn two() -> (TestAuthority, End, End) {
     (authority, a, b)
 }
 
-fn assert_heard(from: &mut End, to: &mut End) {
+fn assert_received(from: &mut End, to: &mut End) {
     let frame = from.seal(&to.id.name, b"hi");
     assert_eq!(to.open(&frame, from.address, NOW), Ok(payload(from, b"hi")));
 }
 
-fn assert_both_heard(a: &mut End, b: &mut End) {
+fn assert_both_received(a: &mut End, b: &mut End) {
     for _ in 0..3 {
-        assert_heard(a, b);
-        assert_heard(b, a);
+        assert_received(a, b);
+        assert_received(b, a);
     }
 }
 
@@ -73,7 +73,7 @@ fn change_attestation(body: &mut Vec<u8>, change: impl FnOnce(&mut Attestation))
 fn certified_nodes_exchange_rights() {
     let (_authority, mut a, mut b) = two();
     introduce(&mut a, &mut b);
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
     let frame = a.seal(&b.id.name, b"once");
     assert!(b.open(&frame, a.address, NOW).is_ok());
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
@@ -133,7 +133,7 @@ fn cell_key_alone_cannot_forge() {
     assert_eq!(
         b.open(&frame, a.address, NOW),
         Ok(payload(&a, b"hi")),
-        "nobody was muted"
+        "no session was muted"
     );
 }
 
@@ -181,7 +181,7 @@ fn foreign_certificate_is_refused() {
     );
     assert_eq!(b.sessions.peers.len(), 0);
     introduce(&mut a, &mut b);
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
 }
 
 #[test]
@@ -225,7 +225,7 @@ fn expired_certificate_ends_session() {
 fn repeated_proof_has_no_effect() {
     let (_authority, mut a, mut b) = two();
     let [_, _, first, _] = introduce(&mut a, &mut b);
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
     let receiver = b.sessions.own;
     let elsewhere = SocketAddr::from(([10, 0, 0, 9], 1));
     assert_eq!(b.open(&first, a.address, NOW), Err(FrameEvent::Replayed));
@@ -249,7 +249,7 @@ fn repeated_proof_has_no_effect() {
         Err(FrameEvent::Untrusted),
         "with another ephemeral key"
     );
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
 }
 
 /// A man in the middle has the cell's key and a certificate of his own.
@@ -304,7 +304,7 @@ fn swapped_handshake_parts_are_refused() {
         ),
         "the honest one counts"
     );
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
 }
 
 /// The holder of one certificate invents any number of observers.
@@ -359,7 +359,7 @@ fn simultaneous_handshakes_open_one_session() {
             let frame = b.seal(&a.id.name, b"hi");
             let _ = a.open(&frame, b.address, at);
         }
-        assert_both_heard(&mut a, &mut b);
+        assert_both_received(&mut a, &mut b);
     }
 }
 
@@ -425,7 +425,7 @@ fn forged_challenges_delay_no_session() {
         meets_again(&mut a, &mut restarted("c", 3), later),
         "another node's places are its own"
     );
-    assert_both_heard(&mut a, &mut b);
+    assert_both_received(&mut a, &mut b);
     let mut b = restarted("b", 2);
     assert!(
         meets_again(&mut a, &mut b, later + Duration::from_secs(1)),

@@ -160,7 +160,7 @@ fn refuses_the_other_cell(city: &City, of_north: &LoadedCredentials, edge: &Node
             .verify_server_cert(broker, &chain, &name, &[], UnixTime::now())
             .is_ok()
     };
-    assert!(!trusts(&stolen), "the foreign cell's");
+    assert!(!trusts(&stolen), "the neighbouring cell's");
     assert!(
         trusts(&certificate(city.cells[0].files_of(edge).0)),
         "the own cell's"

@@ -106,12 +106,12 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 
 pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
-    let trial = Trial {
+    let cell = TryCell {
         templates: arguments.templates(configs.len()).map_err(Failure::usage)?,
         guesses: arguments.guesses(),
         vehicles: Vec::new(),
     };
-    run_to_end(trial.serve(configs, arguments.stop_at_eof))
+    run_to_end(cell.serve(configs, arguments.stop_at_eof))
 }
 
 impl TryArguments {
@@ -305,7 +305,7 @@ fn vehicle(name: NodeName, camera: CameraConfig) -> NodeConfig {
 }
 
 /// The running vehicles of `try`.
-struct Trial {
+struct TryCell {
     /// Files for the configurations of the vehicles; empty without `--output`.
     templates: Vec<Template>,
     /// The guesses about each vehicle.
@@ -351,7 +351,7 @@ impl Vehicle {
 /// Guesses that people who walk replace, if all of them are guesses.
 const MOUNT: [Guess; 2] = [Guess::Height, Guess::Tilt];
 
-impl Trial {
+impl TryCell {
     fn finds_cameras(&self) -> bool {
         MOUNT.iter().all(|guess| self.guesses.contains(guess))
     }
@@ -404,9 +404,12 @@ impl Trial {
             running.camera = Some(camera);
         }
         let node = node::start(running).await?;
-        let mut page = node.dashboard_address();
-        let page = page.wait_for(Option::is_some).await;
-        let page = page.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
+        let mut address = node.dashboard_address();
+        let page = address
+            .wait_for(Option::is_some)
+            .await
+            .context("the page ended")?
+            .unwrap_or(DEFAULT_ADDRESS);
         if self.vehicles.is_empty() {
             config.membership.bind = node.gossip_address();
         }
@@ -470,7 +473,7 @@ impl Trial {
             let line =
                 format!("{rate:.0} frames/s, {objects}, {unplaced} detections without a place");
             let mut output = std::io::stderr().lock();
-            // Failing to show progress does not end the trial.
+            // Failing to show progress does not end the command.
             let _ = if output.is_terminal() {
                 write!(output, "\r\x1b[K{line}").and_then(|()| output.flush())
             } else if line != shown {
@@ -598,8 +601,8 @@ mod tests {
         config
     }
 
-    fn saved_to(path: &Path) -> Trial {
-        Trial {
+    fn saved_to(path: &Path) -> TryCell {
+        TryCell {
             templates: vec![Template::new(path.to_owned()).unwrap()],
             guesses: vec![
                 Guess::FieldOfView,
@@ -615,7 +618,7 @@ mod tests {
     async fn walking_people_replace_guessed_mount() {
         let directory = tempfile::tempdir().unwrap();
         let saved = directory.path().join("node.toml");
-        let trial = saved_to(&saved);
+        let cell = saved_to(&saved);
         let text = || std::fs::read_to_string(&saved).unwrap_or_default();
         let found = || -> Option<[f64; 2]> {
             let config: toml::Table = text().parse().ok()?;
@@ -625,7 +628,7 @@ mod tests {
         };
         let is_found = || found().is_some_and(|[height_m, _]| height_m != CAMERA_HEIGHT_M);
         tokio::select! {
-            outcome = trial.serve(vec![sees_walkers(directory.path())], false) => panic!("ended: {outcome:?}"),
+            outcome = cell.serve(vec![sees_walkers(directory.path())], false) => panic!("ended: {outcome:?}"),
             _ = until("the mount is found", is_found) => {}
         }
         let [height_m, pitch_deg] = found().unwrap();
@@ -643,10 +646,10 @@ mod tests {
     async fn edited_file_survives_found_mount() {
         let directory = tempfile::tempdir().unwrap();
         let saved = directory.path().join("node.toml");
-        let mut trial = saved_to(&saved);
-        let started = trial.start(sees_walkers(directory.path())).await.unwrap();
-        trial.vehicles.push(started);
-        trial.save(0).unwrap();
+        let mut cell = saved_to(&saved);
+        let started = cell.start(sees_walkers(directory.path())).await.unwrap();
+        cell.vehicles.push(started);
+        cell.save(0).unwrap();
         let edited = std::fs::read_to_string(&saved).unwrap() + "# my own\n";
         std::fs::write(&saved, &edited).unwrap();
         let estimate = MountEstimate {
@@ -658,8 +661,8 @@ mod tests {
             roll_sigma_rad: 0.01,
             height_sigma_m: 0.05,
         };
-        trial.use_camera(0, &estimate).await.unwrap();
-        let vehicle = trial.vehicles.remove(0);
+        cell.use_camera(0, &estimate).await.unwrap();
+        let vehicle = cell.vehicles.remove(0);
         let mount = vehicle.config.camera.as_ref().unwrap().mount;
         assert_eq!(
             mount.height_m,
