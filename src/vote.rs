@@ -11,8 +11,8 @@
 //!   sum takes them all);
 //! - votes for a label that was evicted for another.
 //!
-//! A report is rejected if neither its `seq` nor its capture time is newer than the last of its
-//! vehicle, unless the vehicle's clock was set back.
+//! A report is rejected unless its `seq` or its capture time is newer than the last of its vehicle, or
+//! the vehicle's clock was set back.
 
 mod calibration;
 mod config;

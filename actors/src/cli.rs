@@ -67,7 +67,7 @@ Examples:
 
 Files:
   /etc/ecod/node.toml  configuration of this machine's node; commands read it without --config
-  ecod/node.toml       the same of a node that was made without the rights of root
+  ecod/node.toml       the same for a node made without the rights of root
   /etc/ecod/pki        CA of the cell, on the machine where `init` made it
   /var/lib/ecod        state of the service
 
@@ -144,7 +144,7 @@ Examples:
   sudo ecod-node invite --role auto euclid    a node that may take over the lead
   sudo ecod-node invite gauss riemann         two vehicles")]
     Invite(join::InviteArguments),
-    /// Join a cell by a token of `ecod-node invite`, which becomes this machine's node
+    /// Join a cell with a token of `ecod-node invite`, as this machine's node
     #[command(after_long_help = "\
 Examples:
   sudo ecod-node join TOKEN")]
@@ -164,8 +164,7 @@ Examples:
   ecod-node cell dismiss gauss     stop missing a node that is gone for good")]
     #[command(subcommand)]
     Cell(cell::CellCommand),
-    /// Drop the evidence behind the reputations, the highest term, or the cell's description, of a
-    /// node that is stopped
+    /// Drop the evidence, the highest term or the cell's description of a stopped node
     #[command(after_long_help = "\
 Examples:
   ecod-node reset --reputations    while the node is stopped")]

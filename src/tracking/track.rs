@@ -214,7 +214,7 @@ impl Track {
         !self.is_confirmed() && self.vehicle.is_none()
     }
 
-    /// True unless enough detections, and other vehicles than the one that began the track, confirm it.
+    /// True unless enough detections confirm the track, and a second vehicle has detected it.
     pub(super) fn is_sole(&self) -> bool {
         let mut detected = self
             .history

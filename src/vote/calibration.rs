@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-/// Bands of ranks of a confidence among its vehicle's.
+/// Number of rank bands of a vehicle's confidences.
 const BANDS: usize = 10;
 /// Bins of the histogram of a vehicle's confidences.
 const BINS: usize = 20;

@@ -312,7 +312,7 @@ impl DescriptionKeeperState {
                 SaveOutcome::Written => troubles.settle(TroubleKind::NotSaved, Some(DESCRIPTION)),
                 SaveOutcome::Failed => {
                     let cause =
-                        "it cannot be saved, and is learnt anew from other nodes after a restart";
+                        "it cannot be saved; after a restart this node fetches it from other nodes";
                     troubles.record_about(DESCRIPTION, TroubleKind::NotSaved, cause);
                 }
             }

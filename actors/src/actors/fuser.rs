@@ -335,7 +335,7 @@ impl FuserState {
         let lead_us = self.lead_us(report, received_at);
         if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
             let cause = format!(
-                "{}; its reports are put right by that",
+                "{}; its reports are corrected for this",
                 lead_in_words(report, lead_us)
             );
             let node = report.node.as_str();

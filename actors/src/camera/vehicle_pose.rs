@@ -57,7 +57,7 @@ impl PoseConfig {
             return Err(ConfigError::new(
                 "moving",
                 false,
-                "true, or absent, beside `listen`: what stands receives no poses",
+                "true or absent if `listen` is set: a fixed camera receives no poses",
             ));
         }
         check_range("x_m", self.x_m, -1e8, 1e8)?;

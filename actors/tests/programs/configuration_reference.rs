@@ -1,6 +1,6 @@
 //! The lists of keys in docs/configuration.md match the code: descriptions are the first sentences
-//! of the fields' documentation, defaults are those of a loaded configuration, and ranges are the
-//! ones that the loader states when it refuses a value.
+//! of the fields' documentation, defaults are the values of a loaded configuration, and ranges are
+//! the ranges in the loader's errors.
 
 use std::collections::BTreeMap;
 use std::io::Write as _;

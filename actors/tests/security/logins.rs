@@ -122,7 +122,7 @@ async fn followers_skip_distrusted_leader() {
     })
     .await;
     assert!(
-        log.has("there is no login at its broker") && log.has(r#"about="edge""#),
+        log.has("logins at its broker fail") && log.has(r#"about="edge""#),
         "no warning"
     );
     for node in [gauss, euclid, edge] {

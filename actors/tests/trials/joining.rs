@@ -134,7 +134,7 @@ fn three_machines_form_cell() {
         panic!("{tokens:?}")
     };
     let damaged = fails(&["join", &for_gauss[..for_gauss.len() - 1], "--dir", gauss]);
-    assert!(damaged.contains("not the whole of it"), "{damaged}");
+    assert!(damaged.contains("not a complete token"), "{damaged}");
     succeeds(&["join", for_gauss, "--dir", gauss]);
     let again = fails(&["join", for_gauss, "--dir", gauss]);
     assert!(again.contains("the token was used already"), "{again}");

@@ -90,7 +90,7 @@ def arguments() -> Any:
     parser.add_argument("--azimuth", type=float, metavar="DEG", help=compass)
     parser.add_argument("--user", help="for a broker with passwords")
     parser.add_argument("--password", help="default $ECOD_MQTT__PASSWORD")
-    parser.add_argument("--ca", metavar="FILE", help="whose certificates a broker must show; speaks TLS (PEM)")
+    parser.add_argument("--ca", metavar="FILE", help="CA of the broker's certificate (PEM); enables TLS")
     parser.add_argument("--cert", metavar="FILE", help="this vehicle's certificate (PEM)")
     parser.add_argument("--key", metavar="FILE", help="the key of --cert (PEM)")
     parser.add_argument("--broker-name", default=ecod.BROKER_NAME, help="name in the broker's certificate (default: %(default)s)")

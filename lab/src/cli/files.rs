@@ -13,7 +13,7 @@ pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
         .parse()
         .ok()
         .filter(|rate| (0.01..=1000.0).contains(rate));
-    rate.ok_or_else(|| "is no number from 0.01 to 1000".to_owned())
+    rate.ok_or_else(|| "must be a number from 0.01 to 1000".to_owned())
 }
 
 /// The camera in a vehicle's configuration.

@@ -186,7 +186,7 @@ impl Viewers {
     }
 }
 
-/// True if a tile is one of these or lies in one.
+/// True if the set contains a tile, or a larger tile around it.
 fn is_within(tile: Quadkey, tiles: &BTreeSet<Quadkey>) -> bool {
     (0..=tile.digits()).any(|digits| tiles.contains(&tile.outer(digits)))
 }

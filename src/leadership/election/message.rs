@@ -324,8 +324,8 @@ impl ElectionMessage {
             .unwrap_or(0)
     }
 
-    /// True if every value is one that a node sends: epochs no higher than the stated term, a beat
-    /// and a resignation only of the sender's own epoch, and all numbers within their limits.
+    /// True if a node can have sent these values: epochs no higher than the stated term, a beat and a
+    /// resignation only of the sender's own epoch, and all numbers within their limits.
     fn is_plausible(&self) -> bool {
         let known =
             |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);

@@ -112,7 +112,7 @@ fn bucket(column: i32, row: i32, buckets: usize) -> usize {
     spread as usize & (buckets - 1)
 }
 
-/// The column or row of a coordinate; those beyond 32 bits share the outermost.
+/// The column or row of a coordinate, clamped to 32 bits.
 fn cell_index(coordinate_m: f64, cell_m: f64) -> i32 {
     let scaled = coordinate_m / cell_m;
     let truncated = scaled as i32;

@@ -42,7 +42,7 @@ pub enum MountFitError {
     OneDistance(f64),
     /// The boxes fit many mounts.
     #[error(
-        "the boxes leave the pitch open by ±{0:.1}°: let people walk from near the camera to far from it, with their feet \
+        "the boxes determine the pitch only to ±{0:.1}°: let people walk from near the camera to far from it, with their feet \
          in view"
     )]
     Undetermined(f64),

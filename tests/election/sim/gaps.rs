@@ -66,7 +66,7 @@ fn longest_gap(node: &Node, from: u64, now: u64) -> Result<Option<u64>, String> 
 }
 
 /// The largest gap between two accepted rounds of any vehicle that a split cuts off from the leader, in µs; `None`
-/// without such a vehicle, or if none of the cut-off nodes may lead.
+/// if no vehicle is cut off, or if the cut-off nodes include no candidate.
 pub(super) fn split_gap(seed: u64) -> Option<u64> {
     let mut world = cell(seed);
     start_all(&mut world);

@@ -161,7 +161,7 @@ fn wrong_clock_is_reported() {
     }
     let reported = troubles(&fuser);
     let about = Some("late".to_owned());
-    let corrected = "its clock is 5.0 s ahead; its reports are put right by that";
+    let corrected = "its clock is 5.0 s ahead; its reports are corrected for this";
     assert_eq!(
         reported,
         [(about, "clock_off".into(), corrected.into())],

@@ -400,7 +400,7 @@ impl ElectionDriver {
             }
         }
         for name in &self.no_login {
-            let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
+            let cause = "it answers, but logins at its broker fail: this node or others may miss its maps";
             troubles.record_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
         }
         let missing = report_missing_nodes(&self.live_state.expected().missing(), troubles);
@@ -558,7 +558,7 @@ fn clock_words(clock: &WrongClock<'_>) -> String {
         "behind"
     };
     let others = if clock.is_cell_wrong {
-        "the clocks of the others, and the cell goes by it"
+        "the other clocks, and the cell uses it"
     } else {
         "the cell's time"
     };
@@ -617,7 +617,7 @@ fn log(notice: Notice) {
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),
         Notice::ProcessGone { peer, broker } => {
-            tracing::info!(%peer, %broker, "the process of another node is gone");
+            tracing::info!(%peer, %broker, "the process of another node has ended");
         }
         Notice::LeaderDisconnected { peer } => {
             tracing::info!(%peer, "the leader's connection to this node broke");

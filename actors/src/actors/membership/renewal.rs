@@ -13,8 +13,8 @@ use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
 use crate::transport::pki::{Credentials, NewKey, RenewalMessage, renew};
 
-/// Renewals of one node. It decides what to send and what to do beside the membership, whose task
-/// must not wait for disks.
+/// Renewals of one node. It decides what to send, and which work with files runs outside the
+/// membership's task, which must not wait for disks.
 pub(super) struct Renewals {
     credentials: Arc<Credentials>,
     /// Name of this member: the node's, or an observer's.

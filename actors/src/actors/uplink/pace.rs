@@ -25,7 +25,7 @@ pub(super) struct MapPace {
 }
 
 impl MapPace {
-    /// With a map due at once.
+    /// The first map is due at once.
     pub(super) fn new(max_hz: f64) -> Self {
         Self {
             max_hz,

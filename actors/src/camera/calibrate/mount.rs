@@ -62,7 +62,7 @@ pub enum GroundFitError {
     BelowGround,
     /// The points do not determine the mount well enough.
     #[error(
-        "the points leave the pitch open by ±{0:.1}°: spread them over the image, not on one line, and measure again"
+        "the points determine the pitch only to ±{0:.1}°: spread them over the image, not on one line, and measure again"
     )]
     Undetermined(f64),
     /// OpenCV could not solve the equations of the points.

@@ -61,7 +61,7 @@ impl PlacardConfig {
         if !(1..=MAX_PASSES).contains(&self.passes.len()) {
             return Err(ConfigError::new(
                 "passes",
-                self.passes.len(),
+                format!("a list of {} passes", self.passes.len()),
                 format!("1 to {MAX_PASSES} passes"),
             ));
         }

@@ -73,7 +73,7 @@ impl RecordedDetector {
             path: path.clone(),
             source,
         })?;
-        // Empty lines at the end are of editors.
+        // Editors leave empty lines at the end.
         let frames = text
             .trim_end()
             .lines()

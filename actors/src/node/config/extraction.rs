@@ -121,6 +121,11 @@ fn describe(errors: figment::Error) -> String {
                 "must be an IP address and a port, such as 0.0.0.0:1883".to_owned()
             }
             Kind::UnknownField(key, keys) => unknown_key(key, keys),
+            Kind::UnknownVariant(found, known) => format!(
+                "`{}` is not allowed, must be one of `{}`",
+                without_secrets(found),
+                known.join("`, `")
+            ),
             kind => without_secrets(&kind.to_string()),
         };
         // Without a key, the file itself cannot be read as TOML.

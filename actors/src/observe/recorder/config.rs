@@ -83,7 +83,7 @@ impl RecordConfig {
     /// Returns a [`ConfigError`] with the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.dir.as_os_str().is_empty() {
-            return Err(ConfigError::new("dir", "\"\"", "a directory"));
+            return Err(ConfigError::missing("dir", "the directory of the log"));
         }
         check_range("max_file_mb", self.max_file_mb as f64, 1.0, 1e6)?;
         check_range("max_file_s", self.max_file_s as f64, 1.0, 1e7)?;

@@ -25,7 +25,7 @@ pub struct Token {
 /// A text that is not a token, or not a whole one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`"
+    "this is not a complete token; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`"
 )]
 pub struct TokenError;
 

@@ -299,7 +299,7 @@ class LandmarkState:
     y_m: Metres
     contributors: list[Name]
     observers: list[Name] = field(default_factory=list)
-    # Who read what lately, in a cell that votes, too.
+    # Recent readings by node, also in a cell that votes.
     readings: list[LabelReading] = field(default_factory=list)
 
     @property

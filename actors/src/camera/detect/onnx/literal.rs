@@ -68,7 +68,7 @@ impl Parser<'_> {
         }
     }
 
-    /// Entries with commas between them, of which the last may have one, too.
+    /// Comma-separated entries; a trailing comma is allowed.
     fn entries<T>(
         &mut self,
         end: char,
@@ -123,7 +123,7 @@ impl Parser<'_> {
     fn escape(&mut self, text: &mut Vec<u16>) -> Result<(), String> {
         let escaped = self.0.next().ok_or("a quote is missing")?;
         let character = match escaped {
-            // JSON writes a character of a higher plane as two of these.
+            // JSON writes a character above U+FFFF as two escapes.
             'u' => {
                 text.push(self.code(4)? as u16);
                 return Ok(());

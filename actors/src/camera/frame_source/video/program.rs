@@ -81,7 +81,7 @@ fn frames_output() -> io::Result<File> {
 /// Ends this process when its standard input closes, in every state: a library may block forever,
 /// even while a process exits.
 fn end_with_input() {
-    // An input that cannot be read ends the process like one that is closed.
+    // An input that cannot be read ends the process like a closed input.
     let _ = io::copy(&mut io::stdin().lock(), &mut io::sink());
     // A process may always send itself a signal.
     let _ = kill_process(getpid(), Signal::KILL);

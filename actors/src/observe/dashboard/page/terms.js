@@ -8,13 +8,13 @@ const TERMS = {
   latency: "Time from the oldest picture that went into a map until that map arrived here.",
   place: "A known location of the cell, such as a parking spot, that vehicles observe.",
   verdict: "The label of a place on which the vehicles agree, after their votes were weighted.",
-  margin: "Lead of the label over the next best one, in weighted votes. It is close below a quarter of the label's votes.",
+  margin: "Lead of the label over the next best one, in weighted votes. Below a quarter of the label's votes it is close.",
   reputation: "How much a vehicle's reports count, from 0 to 1. It rises where others agree, and falls where they contradict.",
   confidence: "Probability that the object is there, and within 1.5 m of its position. For a place: how sure its label is.",
   existence: "Probability that the object exists and is still there, wherever exactly it stands.",
   witnesses: "The vehicles whose detections of the last seconds went into the object or place.",
   spread: "Half length and half width of the ellipse that holds the true position with a probability of 95 %.",
-  gap: "Time from the last map of the leader before to the first map of this one.",
+  gap: "Time from the previous leader's last map to this leader's first.",
   trouble: "Something that is wrong at present. It disappears from the list when its cause is removed.",
 };
 

@@ -167,7 +167,7 @@ fn refuses_the_other_cell(city: &City, of_north: &LoadedCredentials, edge: &Node
     );
 }
 
-/// Replaces the certificate of a city's vehicle by one of the city's CA that claims all properties
+/// Replaces the certificate of a city's vehicle by a certificate of the city's CA with all properties
 /// of a leader's certificate.
 fn overstate(city: &City, node: &NodeName) {
     let directory = city.city.ca();
