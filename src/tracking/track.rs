@@ -167,7 +167,7 @@ impl Track {
     }
 
     /// Records a detection by `sensors` at `at`, before their histories are updated. The detection
-    /// confirms the track only if the last one by one of the sensors is long enough ago.
+    /// confirms the track only if a sensor's previous detection is long enough ago.
     pub(super) fn record_hit_by(
         &mut self,
         mut sensors: impl Iterator<Item = SensorId>,

@@ -268,8 +268,8 @@ impl Belief {
 mod tests {
     use super::*;
 
-    /// Each label has a third of the evidence of the previous one, so none is used up by the later
-    /// ones.
+    /// Each label has a third of the previous label's evidence, so that later labels do not use it
+    /// up.
     #[test]
     fn ever_new_labels_are_bounded() {
         let config = PaceConfig::default();

@@ -15,7 +15,7 @@ const START: Timestamp = Timestamp(1_700_000_000_000_000);
 type Statement = (usize, usize, usize, f64, f64);
 
 /// In a cell without a list of locations, one vehicle names 600 at once; each gets its verdict
-/// within some rounds, and none delays those of another vehicle.
+/// within some rounds, and another vehicle gets its verdicts at once.
 #[test]
 fn sole_verdicts_are_spread_over_rounds() {
     let votes = |names: std::ops::Range<usize>, node: &'static str| {
