@@ -95,13 +95,14 @@ eval-tracks: setup ## [measure] tracking in generated traffic beside single vehi
 	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/results.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
 # DIR holds copies of the repositories that docs/evaluation.md names; the program names missing ones.
-eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
+eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP; the table goes into docs/results.md
 	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/evaluation.md names"; exit 2; }
-	cargo build --release --locked --bin ecod-node --bin ecod-lab
+	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-lab
 	@status=0; \
-	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real || status=1; \
+	cargo run --quiet --locked --example eval_real -- --program $(PROGRAMS)/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real \
+	    --write-table docs/results.md || status=1; \
 	for set in CF CF_amt SP SP_amt; do \
-	    cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node \
+	    cargo run --quiet --locked --example eval_labels -- --program $(PROGRAMS)/ecod-node \
 	        --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || status=1; \
 	done; exit $$status
 

@@ -1,7 +1,8 @@
 //! Accuracy on real recordings, measured with the programs: detections are replayed as reports, and judged by `eval`.
 //! Positions from ranging by the ground are compared with annotated positions.
 //!
-//! `make eval-real DIR=…`, or `cargo run --example eval_real -- --program target/release/ecod-node --data DIR [--work DIR]`
+//! `make eval-real DIR=…`, or `cargo run --example eval_real -- --program target/release/ecod-node --data DIR [--work DIR]
+//! [--write-table FILE]`
 //!
 //! DIR contains copies of public repositories under their original names; `docs/evaluation.md` has the list. The
 //! program names each missing copy, judges all others, and then fails.
@@ -18,6 +19,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 use ecod::wire::ObjectReport;
+use ecod_lab::document::write_table;
 use serde_json::Value;
 use wildtrack::Wildtrack;
 
@@ -50,6 +52,22 @@ const COLUMNS: [&str; 17] = [
     "switches, fragments",
 ];
 
+/// Columns of the table of `--write-table`, which has the rows of the default configuration only.
+const WRITTEN: [&str; 12] = [
+    "set",
+    "method",
+    "AP@0.5",
+    "AP@1",
+    "AP@2",
+    "AP@4",
+    "MODA@1",
+    "best F1",
+    "mean error",
+    "confidence off",
+    "HOTA",
+    "IDF1",
+];
+
 /// Configuration without correction of poses.
 const UNALIGNED: &str = "[fusion.tracks]\nalign = false\n";
 
@@ -70,6 +88,7 @@ fn main() -> anyhow::Result<()> {
     let mut program = PathBuf::from("target/release/ecod-node");
     let mut data = PathBuf::new();
     let mut work = PathBuf::from("target/eval-real");
+    let mut document = None;
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args
@@ -79,6 +98,7 @@ fn main() -> anyhow::Result<()> {
             "--program" => program = value.into(),
             "--data" => data = value.into(),
             "--work" => work = value.into(),
+            "--write-table" => document = Some(PathBuf::from(value)),
             _ => bail!("unknown option {key}"),
         }
     }
@@ -109,28 +129,36 @@ fn main() -> anyhow::Result<()> {
     if let Some(wildtrack) = &wildtrack {
         foot_points::print(wildtrack);
     }
-    println!(
-        "| {} |\n|{}",
-        COLUMNS.join(" | "),
-        "---|".repeat(COLUMNS.len())
-    );
+    print!("{}", head(&COLUMNS));
+    let mut written = head(&WRITTEN);
     if let Some((detections, truth)) = kitti {
         let last = &kitti::SEQUENCES[kitti::FITTED..];
         for (name, sequences) in [("KITTI", &kitti::SEQUENCES[..]), ("KITTI, last five", last)] {
-            judge(
-                &program,
-                &kitti::convert(name, sequences, &detections, &truth, &folder(&work, name)?)?,
-            )?;
+            let folder = folder(&work, name)?;
+            let recording = kitti::convert(name, sequences, &detections, &truth, &folder)?;
+            written += &judge(&program, &recording)?;
         }
     }
     if let Some(wildtrack) = wildtrack {
-        judge(&program, &wildtrack.convert(&folder(&work, "wildtrack")?)?)?;
+        let recording = wildtrack.convert(&folder(&work, "wildtrack")?)?;
+        written += &judge(&program, &recording)?;
     }
-    if missing.is_empty() {
-        Ok(())
-    } else {
-        bail!("{} of the data are missing", missing.len())
+    if !missing.is_empty() {
+        bail!("{} of the data are missing", missing.len());
     }
+    if let Some(document) = document {
+        write_table(&document, "real", &written)?;
+    }
+    Ok(())
+}
+
+/// The head of a table in Markdown.
+fn head(columns: &[&str]) -> String {
+    format!(
+        "| {} |\n|{}\n",
+        columns.join(" | "),
+        "---|".repeat(columns.len())
+    )
 }
 
 /// Creates an empty folder, in place of an existing one.
@@ -143,7 +171,8 @@ fn folder(work: &Path, name: &str) -> anyhow::Result<PathBuf> {
     Ok(folder)
 }
 
-fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
+/// Prints the rows of a recording; returns those for `--write-table`.
+fn judge(program: &Path, recording: &Recording) -> anyhow::Result<String> {
     let Recording {
         name,
         others,
@@ -151,8 +180,10 @@ fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
         is_fused,
         ..
     } = recording;
-    for (method, said) in others {
-        row(name, method, false, &eval(program, recording, said)?);
+    let mut written = String::new();
+    for (method, maps) in others {
+        let cells = row(name, method, false, &eval(program, recording, maps)?);
+        written += &written_row(&cells);
     }
     let maps = reports.with_file_name("maps.jsonl");
     let replay = || {
@@ -166,7 +197,8 @@ fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
         replay
     };
     run(&mut replay())?;
-    row(name, "ecod", true, &eval(program, recording, &maps)?);
+    let cells = row(name, "ecod", true, &eval(program, recording, &maps)?);
+    written += &written_row(&cells);
     if *is_fused {
         let config = reports.with_file_name("unaligned.toml");
         fs::write(&config, UNALIGNED)?;
@@ -178,7 +210,7 @@ fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
             &eval(program, recording, &maps)?,
         );
     }
-    Ok(())
+    Ok(written)
 }
 
 fn eval(program: &Path, recording: &Recording, input: &Path) -> anyhow::Result<Value> {
@@ -214,8 +246,8 @@ fn run(command: &mut Command) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints a row of the table. Only tracks have identities.
-fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
+/// Prints a row of the table and returns its cells. Only tracks have identities.
+fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) -> Vec<String> {
     let figure =
         |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));
     let share = |value: &Value| figure(value, 1);
@@ -232,11 +264,23 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
     let identities = [share(&at["hota_pct"]), share(&at["idf1_pct"]), Some(counts)];
     let is_judged = is_tracked && !at["idf1_pct"].is_null();
     shares.extend(identities.map(|figure| figure.filter(|_| is_judged)));
-    let cells: Vec<String> = shares
+    let figures = shares
         .into_iter()
-        .map(|cell| cell.unwrap_or_else(|| "-".to_owned()))
+        .map(|cell| cell.unwrap_or_else(|| "-".to_owned()));
+    let names = [set, method].map(str::to_owned);
+    let cells: Vec<String> = names.into_iter().chain(figures).collect();
+    println!("| {} |", cells.join(" | "));
+    cells
+}
+
+/// The cells of the columns [`WRITTEN`] as a row.
+fn written_row(cells: &[String]) -> String {
+    let columns = COLUMNS.iter().zip(cells);
+    let written: Vec<&str> = columns
+        .filter(|(column, _)| WRITTEN.contains(column))
+        .map(|(_, cell)| cell.as_str())
         .collect();
-    println!("| {set} | {method} | {} |", cells.join(" | "));
+    format!("| {} |\n", written.join(" | "))
 }
 
 /// Writes reports as lines.
