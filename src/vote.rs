@@ -29,7 +29,6 @@ mod likelihood;
 mod method;
 mod named_landmarks;
 mod paper;
-mod verdict_share;
 mod visibility;
 mod weighted;
 
@@ -55,7 +54,6 @@ use crate::wire::{
 use configured_method::ConfiguredMethod;
 use method::NewVote;
 use named_landmarks::NamedLandmarks;
-use verdict_share::PostponedVerdicts;
 
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -116,8 +114,6 @@ pub struct Vote {
     landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
     /// Landmarks of an open cell.
     named: NamedLandmarks,
-    /// News about landmarks of an open cell for later rounds.
-    postponed: PostponedVerdicts,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
     /// Vacancy signs that were recently read, with the time, by vehicle.
@@ -141,7 +137,6 @@ impl Vote {
                 .map(|l| (l.id.clone(), Some(Box::new(l))))
                 .collect(),
             named: NamedLandmarks::default(),
-            postponed: PostponedVerdicts::default(),
             last_reports: BTreeMap::new(),
             method,
             signs: BTreeMap::new(),
@@ -467,8 +462,7 @@ impl Vote {
     /// Ends the round: evaluates the landmarks that changed.
     ///
     /// In `paper` mode the counts of frames start again for the next packet. A cell with a list of
-    /// landmarks gets all verdicts, an open cell the changed ones. Except in `paper` mode, changes
-    /// beyond a vehicle's share follow in the next rounds.
+    /// landmarks gets all verdicts, an open cell the changed ones.
     ///
     /// # Example
     /// Three vehicles vote `car` at `slot-3`, one votes `van`. Closing judges the landmark: the
@@ -481,15 +475,11 @@ impl Vote {
                 .for_each(|last| last.frames = 0);
         }
         let (changed, evidence) = self.method.get_mut().close(now);
-        let verdicts = if self.open && self.config.mode == VoteMode::Paper {
+        let verdicts = if self.open {
             changed
                 .iter()
                 .filter_map(|landmark| self.method.get().verdict(landmark))
                 .collect()
-        } else if self.open {
-            let method = self.method.get();
-            self.postponed
-                .next(changed, |landmark| method.verdict(landmark))
         } else {
             self.verdicts().collect()
         };

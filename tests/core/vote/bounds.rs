@@ -14,43 +14,6 @@ const START: Timestamp = Timestamp(1_700_000_000_000_000);
 /// (vehicle, landmark, label, confidence, distance)
 type Statement = (usize, usize, usize, f64, f64);
 
-/// In a cell without a list of locations, one vehicle names 600 at once; each gets its verdict
-/// within some rounds, and another vehicle gets its verdicts at once.
-#[test]
-fn sole_verdicts_are_spread_over_rounds() {
-    let votes = |names: std::ops::Range<usize>, node: &'static str| {
-        let object = |place: usize| PerceivedObject {
-            landmark: Some(format!("place-{place:04}").as_str().into()),
-            ..PerceivedObject::new("car", 0.9, 0.0, 0.0)
-        };
-        ObjectReport {
-            objects: names.map(object).collect(),
-            ..ObjectReport::new(NodeName::from_static(node), 1, START)
-        }
-    };
-    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
-    vote.observe(&votes(0..600, "mallory"), START).unwrap();
-    vote.observe(&votes(600..620, "euclid"), START).unwrap();
-    let mut received: Vec<BTreeSet<LandmarkId>> = Vec::new();
-    for round in 0..10 {
-        let verdicts = vote
-            .close(START + Duration::from_millis(100 * round))
-            .verdicts;
-        assert!(serde_json::to_vec(&verdicts).unwrap().len() < 48 * 1024);
-        received.push(
-            verdicts
-                .into_iter()
-                .map(|verdict| verdict.landmark)
-                .collect(),
-        );
-    }
-    let first = &received[0];
-    assert!((600..620).all(|place| first.contains(&*format!("place-{place:04}"))));
-    assert!(first.len() < 320, "{}", first.len());
-    let all: BTreeSet<_> = received.into_iter().flatten().collect();
-    assert_eq!(all.len(), 620);
-}
-
 fn statement() -> impl Strategy<Value = Statement> {
     (0usize..6, 0usize..3, 0usize..4, 0.0f64..=1.0, 0.0f64..60.0)
 }
