@@ -65,7 +65,7 @@ fn started_cell_is_measured_keeping_figures() {
     let found = &figures["cell"]["saturation"];
     let expected = match found["first_saturated"].as_str() {
         Some(first) => format!("saturated first: {first}"),
-        None => "no saturation up to 8 vehicles".to_owned(),
+        None => "nothing saturated up to 8 vehicles".to_owned(),
     };
     assert!(text.contains(&expected), "{text}");
     assert_eq!(found["steps"][0]["vehicles"], 4);
