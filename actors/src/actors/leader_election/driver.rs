@@ -398,7 +398,8 @@ impl ElectionDriver {
             }
         }
         for name in &self.no_login {
-            let cause = "it answers, but logins at its broker fail: this node or others may miss its maps";
+            let cause =
+                "it answers, but logins at its broker fail: this node or others may miss its maps";
             troubles.record_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
         }
         let missing = report_missing_nodes(&self.live_state.expected().missing(), troubles);
