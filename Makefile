@@ -179,11 +179,11 @@ other-features: setup ## compile the node with other sets of features, and the f
 audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit
 
-snapshots: ## messages, their schemas, help, error texts and tables of keys against their snapshots; INSTA_UPDATE=always writes these anew
-	cargo test --locked --quiet --test core messages::
+snapshots: ## messages, their schemas, help, error texts, remedies and tables of keys against their snapshots; INSTA_UPDATE=always writes these anew
+	cargo test --locked --quiet --test core -- messages:: troubles::
 	cargo test --locked --quiet -p ecod-actors -p ecod-lab --test programs -- help:: errors:: configuration_reference:: schema::
-	cargo test --locked --quiet -p ecod-region --test engine -- help::
-	cargo test --locked --quiet -p ecod-interop --test bridges -- help::
+	cargo test --locked --quiet -p ecod-region --test engine -- help:: errors::
+	cargo test --locked --quiet -p ecod-interop --test bridges -- help:: errors::
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
 	packaging/check-core

@@ -102,7 +102,7 @@ pub enum RosBridgeError {
     #[error("DDS: {0}; is the domain right, and the network up?")]
     Dds(String),
     /// A domain beyond the last.
-    #[error("domain {0} is none of 0 to {MAX_DOMAIN}")]
+    #[error("domain {0} must be a number from 0 to {MAX_DOMAIN}")]
     Domain(u16),
     /// A network to which this machine does not belong.
     #[error("network {0}: no address of this machine; `ip address` shows them")]

@@ -7,6 +7,7 @@
 mod camera;
 mod cell;
 mod config;
+mod errors;
 mod help;
 mod member;
 mod people;
@@ -16,6 +17,7 @@ mod wait;
 pub use camera::car_ahead;
 pub use cell::Cell;
 pub use config::{free_gossip_address, greet, loopback, name, node_config};
+pub use errors::{error_case, errors_of};
 pub use help::help_of;
 pub use member::{Member, member_config};
 pub use people::walking_people;

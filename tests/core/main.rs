@@ -8,4 +8,5 @@ mod pace;
 mod replays;
 mod rooms;
 mod tracks;
+mod troubles;
 mod vote;

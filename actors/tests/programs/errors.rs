@@ -2,10 +2,8 @@
 //!
 //! A change is accepted by `INSTA_UPDATE=always make snapshots`.
 
-use std::fmt::Write;
-
 use ecod_actors::node::config::NodeConfig;
-use ecod_testkit::command;
+use ecod_testkit::{command, error_case, errors_of};
 
 /// Configurations that cannot be used, each in one way.
 const CONFIGURATIONS: &[&str] = &[
@@ -80,38 +78,22 @@ const DESCRIPTIONS: &[&str] = &[
 ];
 
 /// Command lines that cannot be carried out in an empty folder, each for another reason.
-const COMMANDS: &[&[&str]] = &[
-    &["--role", "leader"],
-    &["--name", "two/parts"],
-    &["--config", "missing.toml"],
-    &["--confg", "node.toml"],
-    &["join", "not-a-token"],
-    &["join", "ecod1-AAAA"],
-    &["pki", "issue", "edge"],
-    &["pki", "revoke", "edge"],
-    &["cell", "set", "missing.toml"],
-    &["report", "missing.jsonl"],
-    &[
-        "replay",
-        "--input",
-        "missing.jsonl",
-        "--output",
-        "maps.jsonl",
-    ],
-    &["replay", "--input", "same.jsonl", "--output", "same.jsonl"],
-    &["status", "--jsn"],
-    &["nodee"],
+const COMMANDS: &[&str] = &[
+    "--role leader",
+    "--name two/parts",
+    "--config missing.toml",
+    "--confg node.toml",
+    "join not-a-token",
+    "join ecod1-AAAA",
+    "pki issue edge",
+    "pki revoke edge",
+    "cell set missing.toml",
+    "report missing.jsonl",
+    "replay --input missing.jsonl --output maps.jsonl",
+    "replay --input same.jsonl --output same.jsonl",
+    "status --jsn",
+    "nodee",
 ];
-
-/// The text that a case is about, and the error.
-fn case(text: &str, error: &str) -> String {
-    let mut shown = String::new();
-    for line in text.lines() {
-        writeln!(shown, "| {line}").unwrap();
-    }
-    writeln!(shown, "{}\n", error.trim_end()).unwrap();
-    shown
-}
 
 /// The program's output about a configuration.
 fn refused(text: &str) -> String {
@@ -123,7 +105,7 @@ fn refused(text: &str) -> String {
         .output()
         .unwrap();
     assert_eq!(output.status.code(), Some(2), "{text} can be used");
-    case(text, &String::from_utf8(output.stderr).unwrap())
+    error_case(text, &String::from_utf8(output.stderr).unwrap())
 }
 
 #[test]
@@ -143,24 +125,13 @@ fn of_descriptions() {
     let node = NodeConfig::default();
     let refused = DESCRIPTIONS.iter().map(|text| {
         let error = node.described(text).expect_err(text);
-        case(text, &error.to_string())
+        error_case(text, &error.to_string())
     });
     insta::assert_snapshot!(refused.collect::<String>());
 }
 
 #[test]
 fn of_commands() {
-    let mut shown = String::new();
-    for arguments in COMMANDS {
-        let directory = tempfile::tempdir().unwrap();
-        let output = command(env!("CARGO_BIN_EXE_ecod-node"))
-            .args(*arguments)
-            .current_dir(directory.path())
-            .output()
-            .unwrap();
-        assert!(!output.status.success(), "{arguments:?} is carried out");
-        let text = format!("ecod-node {}", arguments.join(" "));
-        shown += &case(&text, &String::from_utf8(output.stderr).unwrap());
-    }
+    let shown = errors_of(env!("CARGO_BIN_EXE_ecod-node"), COMMANDS, |_| {});
     insta::assert_snapshot!(shown);
 }

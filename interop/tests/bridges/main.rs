@@ -4,6 +4,8 @@ mod cpm;
 #[cfg(feature = "dds")]
 mod dds;
 #[cfg(all(feature = "dds", feature = "ros2"))]
+mod errors;
+#[cfg(all(feature = "dds", feature = "ros2"))]
 mod help;
 #[cfg(feature = "ros2")]
 mod ros2;

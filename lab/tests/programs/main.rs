@@ -2,6 +2,7 @@
 
 mod bench;
 mod demo;
+mod errors;
 mod eval;
 mod help;
 mod report;

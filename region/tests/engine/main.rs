@@ -3,6 +3,7 @@
 mod broker;
 mod cell;
 mod cluster;
+mod errors;
 mod help;
 mod many;
 mod page;
