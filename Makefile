@@ -121,7 +121,7 @@ test: export RUST_TEST_THREADS ?= $(shell expr 2 '*' $$(nproc))
 test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
 test: setup ## [check] all tests
 ifeq ($(shell cargo nextest --version >/dev/null 2>&1 && echo nextest),nextest)
-	cargo nextest run --locked --test-threads $$((3 * $$(nproc))) $(TEST_FLAGS)
+	cargo nextest run --locked --test-threads $$((4 * $$(nproc))) $(TEST_FLAGS)
 	$(if $(findstring --no-run,$(TEST_FLAGS)),,cargo test --locked --doc)
 else
 	cargo test --locked $(TEST_FLAGS)
