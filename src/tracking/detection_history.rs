@@ -39,6 +39,10 @@ impl DetectionHistory {
         self.slot_of(sensor).map(|slot| &self.histories[slot])
     }
 
+    pub(super) fn get_mut(&mut self, sensor: SensorId) -> Option<&mut SensorHistory> {
+        self.slot_of(sensor).map(|slot| &mut self.histories[slot])
+    }
+
     /// State of a vehicle before its next observation.
     pub(super) fn state_of(&self, sensor: SensorId) -> ObservationState {
         self.get(sensor)

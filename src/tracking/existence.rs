@@ -229,6 +229,8 @@ pub(super) struct SensorHistory {
     pub(super) state: ObservationState,
     pub(super) observed_at: Timestamp,
     pub(super) last_hit: Option<Timestamp>,
+    /// The last detection that confirmed the track.
+    pub(super) confirmed_at: Option<Timestamp>,
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
     pub(super) observations: u32,
@@ -263,6 +265,7 @@ impl SensorHistory {
             state: ObservationState::First,
             observed_at: at,
             last_hit: None,
+            confirmed_at: None,
             position: Vector2::zeros(),
             observations: 0,
             is_view_known: false,
@@ -290,6 +293,7 @@ impl SensorHistory {
         self.unjudged.hits += 1;
         self.unjudged.observations += 1;
         self.state = self.state.after(true);
+        self.confirmed_at.get_or_insert(at);
         if self.last_hit.is_none_or(|last| at >= last) {
             self.last_hit = Some(at);
             self.position = position;

@@ -645,6 +645,24 @@ fn vehicle_fills_only_its_share() {
     assert!(tracker.losses().refused > 0);
 }
 
+/// At 60 images a second, every second detection confirms the track, which then has a velocity.
+#[test]
+fn fast_camera_confirms_its_tracks() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..30 {
+        let captured_at_us = Timestamp(at(0).0 + frame * 16_667);
+        let report = ObjectReport {
+            captured_at_us,
+            ..report("euclid", frame, vec![car(0.1 * frame as f64, 0.0)])
+        };
+        tracker.observe(report, captured_at_us);
+        round = tracker.close(captured_at_us);
+    }
+    let velocity = round.objects[0].velocity_mps.unwrap();
+    assert!((4.0..8.0).contains(&velocity[0]), "{velocity:?}");
+}
+
 /// Parts of a vehicle that report the same objects within microseconds are one observation, which
 /// confirms no object: the tracks end early, so that the vehicle's share has room for others.
 #[test]

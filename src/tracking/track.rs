@@ -167,19 +167,20 @@ impl Track {
     }
 
     /// Records a detection by `sensors` at `at`, before their histories are updated. The detection
-    /// confirms the track only if a sensor's previous detection is long enough ago.
-    pub(super) fn record_hit_by(
-        &mut self,
-        mut sensors: impl Iterator<Item = SensorId>,
-        at: Timestamp,
-    ) {
-        let confirms = sensors.any(|sensor| {
-            let last = self
-                .history
-                .get(sensor)
-                .and_then(|history| history.last_hit);
-            last.is_none_or(|last| at.since(last) >= CONFIRMING_INTERVAL)
-        });
+    /// confirms the track only if a sensor's last confirming detection is long enough ago.
+    pub(super) fn record_hit_by(&mut self, sensors: impl Iterator<Item = SensorId>, at: Timestamp) {
+        let mut confirms = false;
+        for sensor in sensors {
+            let Some(history) = self.history.get_mut(sensor) else {
+                confirms = true;
+                continue;
+            };
+            let last = history.confirmed_at;
+            if last.is_none_or(|last| at.since(last) >= CONFIRMING_INTERVAL) {
+                history.confirmed_at = Some(at);
+                confirms = true;
+            }
+        }
         if confirms {
             self.record_hit(at);
         } else {
