@@ -116,15 +116,21 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
 
 /// Tokens of the largest report among the reports of a vehicle: decoding it costs as much processor
 /// time as that many small ones, whether or not it is fused.
-pub(crate) const LARGEST_REPORT: u32 = 12;
+const LARGEST_REPORT: u32 = 12;
 
-/// Tokens of the largest message with boxes, which are also projected and encoded as reports.
-pub(crate) const LARGEST_BOXES: u32 = 64;
+/// Size in bytes of boxes that take a token, about 90 in JSON: they are decoded, projected, and
+/// encoded as reports.
+const BOX_BYTES_EACH: usize = 6 * 1024;
 
-/// Tokens of a message of `bytes`, if a message of `max_bytes` takes `largest`; at least 1.
-pub(crate) fn tokens_by_size(bytes: usize, max_bytes: usize, largest: u32) -> u32 {
+/// Tokens of a report of `bytes`, if the largest has `max_bytes`; at least 1.
+pub(crate) fn tokens_of_report(bytes: usize, max_bytes: usize) -> u32 {
     let share = bytes.min(max_bytes) as f64 / max_bytes.max(1) as f64;
-    ((share * f64::from(largest)) as u32).max(1)
+    ((share * f64::from(LARGEST_REPORT)) as u32).max(1)
+}
+
+/// Tokens of a message with boxes; at least 1.
+pub(crate) fn tokens_of_boxes(bytes: usize) -> u32 {
+    u32::try_from(bytes / BOX_BYTES_EACH).map_or(u32::MAX, |tokens| tokens.max(1))
 }
 
 /// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴

@@ -24,7 +24,7 @@ use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use super::security::Security;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
-use crate::platform::throttle::{KeyedThrottle, LARGEST_REPORT, tokens_by_size};
+use crate::platform::throttle::{KeyedThrottle, tokens_of_report};
 use crate::telemetry::counters::{Counters, Event, ShedReason};
 
 /// Decodes, checks and delivers packets; shared by the links of a gateway.
@@ -342,8 +342,8 @@ impl Inbox {
             return Ok(self.echo());
         }
         let throttle = &self.report_throttles[kind as usize];
-        let count = tokens_by_size(payload.len(), self.limits.payload_bytes, LARGEST_REPORT)
-            .min(self.max_report_hz);
+        let count =
+            tokens_of_report(payload.len(), self.limits.payload_bytes).min(self.max_report_hz);
         let is_shed = self.is_shed(
             throttle,
             ShedReason::ReportThrottled,
@@ -689,7 +689,7 @@ mod tests {
                 ..ObjectReport::new(NodeName::from_static(node), ms, Timestamp(ms))
             };
             let payload = encode(&report, Encoding::Json);
-            let share = tokens_by_size(payload.len(), inbox.limits.payload_bytes, LARGEST_REPORT);
+            let share = tokens_of_report(payload.len(), inbox.limits.payload_bytes);
             assert_eq!(share, 7);
             accept(&inbox, topic, &payload, Timestamp(ms * 1000));
         }

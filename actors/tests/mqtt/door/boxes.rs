@@ -89,11 +89,14 @@ async fn many_boxes_count_as_several() {
         if reason == "Success" {
             accepted += 1;
         } else {
-            assert!(text.contains("counts as up to"), "{reason} {text}");
+            assert!(text.contains("count as several"), "{reason} {text}");
         }
     }
-    let most = 3.0 + 4.0 * began.elapsed().as_secs_f64();
-    assert!(f64::from(accepted) <= most, "{accepted} of {most}");
+    let most = 5.0 + 5.0 * began.elapsed().as_secs_f64();
+    assert!(
+        (1.0..=most).contains(&f64::from(accepted)),
+        "{accepted} of {most}"
+    );
     tokio::time::sleep(Duration::from_millis(100)).await;
     let (reason, text) = program
         .ask(topic, boxes(name, 40).to_string().into_bytes())

@@ -38,7 +38,7 @@ use super::{
     Publication, lock,
 };
 use crate::platform::clock;
-use crate::platform::throttle::{LARGEST_BOXES, LARGEST_REPORT, tokens_by_size};
+use crate::platform::throttle::{tokens_of_boxes, tokens_of_report};
 use crate::telemetry::counters::{Event, ShedReason};
 use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
 
@@ -171,7 +171,7 @@ impl Door {
         let setup = &door.setup;
         let topic = Topic::Boxes(name.clone());
         let now = clock::now();
-        let tokens = tokens_by_size(payload.len(), setup.limits.payload_bytes, LARGEST_BOXES);
+        let tokens = tokens_of_boxes(payload.len());
         match route {
             BoxRoute::Node => door.check_rate(ReportKind::Detections, tokens, now)?,
             BoxRoute::Broker => door.check_nodeless_rate(&name.vehicle(), tokens, now)?,
@@ -325,7 +325,7 @@ impl DoorState {
         };
         self.check_name(principal, &name)?;
         let now = clock::now();
-        let tokens = tokens_by_size(payload.len(), setup.limits.payload_bytes, LARGEST_REPORT);
+        let tokens = tokens_of_report(payload.len(), setup.limits.payload_bytes);
         self.check_rate(kind, tokens, now)?;
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
@@ -369,7 +369,7 @@ impl DoorState {
         }
         let node = &self.setup.node;
         let text = format!(
-            "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz; a large report counts as up to {LARGEST_BOXES}"
+            "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz; large reports count as several"
         );
         Err(DoorRefusal::new(RefusalReason::Throttled, text))
     }
@@ -387,7 +387,7 @@ impl DoorState {
             return Ok(());
         }
         let text = format!(
-            "{vehicle} reports boxes more than {most} times a second, as mqtt.max_report_hz allows; a large message counts as up to {LARGEST_BOXES}"
+            "{vehicle} reports boxes more than {most} times a second, as mqtt.max_report_hz allows; large messages count as several"
         );
         Err(DoorRefusal::new(RefusalReason::Throttled, text))
     }
