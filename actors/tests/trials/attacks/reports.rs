@@ -9,7 +9,8 @@ use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    Encoding, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, Role, Trouble, encode,
+    BoxCamera, BoxReport, Encoding, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject,
+    PixelBox, Role, SCHEMA_VERSION, Trouble, WirePose, encode, encode_boxes,
 };
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::Authority;
@@ -50,6 +51,18 @@ pub(crate) const ROWS: &[Row] = &[
         },
         quick: false,
         run: |target| Box::pin(report_for_ever(target, 9, Duration::from_millis(40), crowd)),
+    },
+    Row {
+        attack: "1000 boxes in each message, of a lens with strong distortion",
+        means: Means::Vehicle,
+        on_brokers: true,
+        deeds: (100, "messages"),
+        bar: Bar {
+            longest_gap_ms: Some(200),
+            ..UNHARMED
+        },
+        quick: false,
+        run: |target| Box::pin(send_boxes_for_ever(target)),
     },
     Row {
         attack: "an invented object, until the vehicle is revoked",
@@ -148,6 +161,57 @@ async fn report_in_name(
                 }
                 target.did(count);
                 sleep(period).await;
+            }
+        }
+        sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Sends messages with 1000 boxes each, which the broker's node projects, in the name of the vehicle.
+async fn send_boxes_for_ever(target: Target) -> anyhow::Result<()> {
+    let camera = BoxCamera {
+        width_px: 1000,
+        height_px: 1000,
+        fx: Some(1000.0),
+        fy: Some(1000.0),
+        cx: Some(500.0),
+        cy: Some(400.0),
+        distortion: vec![10.0, 0.0, 0.0, 0.0],
+        ..BoxCamera::default()
+    };
+    let person = PixelBox {
+        label: "person".into(),
+        confidence: 0.9,
+        x_min: 450.0,
+        y_min: 320.0,
+        x_max: 550.0,
+        y_max: 670.0,
+    };
+    let mut report = BoxReport {
+        schema: SCHEMA_VERSION,
+        node: NodeName::from_static(VEHICLE),
+        seq: 0,
+        captured_at_us: clock::now(),
+        pose: WirePose {
+            height_m: Some(1.3),
+            ..WirePose::new(40.0, 40.0, 0.0)
+        },
+        camera,
+        boxes: vec![person; 1000],
+        moving: None,
+    };
+    let topic = format!("ecod/v1/{CELL}/boxes/{VEHICLE}");
+    loop {
+        if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
+            loop {
+                report.seq += 1;
+                report.captured_at_us = clock::now();
+                let packet = publish(&topic, &encode_boxes(&report));
+                if stream.write_all(&packet).await.is_err() {
+                    break;
+                }
+                target.did(1);
+                sleep(Duration::from_millis(10)).await;
             }
         }
         sleep(Duration::from_millis(100)).await;
