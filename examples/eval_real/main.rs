@@ -52,20 +52,20 @@ const COLUMNS: [&str; 17] = [
     "switches, fragments",
 ];
 
-/// Columns of the table of `--write-table`, which has the rows of the default configuration only.
-const WRITTEN: [&str; 12] = [
-    "set",
-    "method",
-    "AP@0.5",
-    "AP@1",
-    "AP@2",
-    "AP@4",
-    "MODA@1",
-    "best F1",
-    "mean error",
-    "confidence off",
-    "HOTA",
-    "IDF1",
+/// Columns of the table of `--write-table` and their headings there. It has the rows of the default configuration only.
+const WRITTEN: [(&str, &str); 12] = [
+    ("set", "set"),
+    ("method", "method"),
+    ("AP@0.5", "AP@0.5"),
+    ("AP@1", "AP@1"),
+    ("AP@2", "AP@2"),
+    ("AP@4", "AP@4"),
+    ("MODA@1", "MODA@1"),
+    ("best F1", "best F1"),
+    ("mean error", "mean error, m"),
+    ("confidence off", "calibration error, %"),
+    ("HOTA", "HOTA"),
+    ("IDF1", "IDF1"),
 ];
 
 /// Configuration without correction of poses.
@@ -130,7 +130,7 @@ fn main() -> anyhow::Result<()> {
         foot_points::print(wildtrack);
     }
     print!("{}", head(&COLUMNS));
-    let mut written = head(&WRITTEN);
+    let mut written = head(&WRITTEN.map(|(_, heading)| heading));
     if let Some((detections, truth)) = kitti {
         let last = &kitti::SEQUENCES[kitti::FITTED..];
         for (name, sequences) in [("KITTI", &kitti::SEQUENCES[..]), ("KITTI, last five", last)] {
@@ -277,7 +277,7 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) -> Vec<String>
 fn written_row(cells: &[String]) -> String {
     let columns = COLUMNS.iter().zip(cells);
     let written: Vec<&str> = columns
-        .filter(|(column, _)| WRITTEN.contains(column))
+        .filter(|(column, _)| WRITTEN.iter().any(|(written, _)| written == *column))
         .map(|(_, cell)| cell.as_str())
         .collect();
     format!("| {} |\n", written.join(" | "))
