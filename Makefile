@@ -33,7 +33,7 @@ check: ## [check] format, clippy and unit tests of the core and of the node with
 	cargo test --locked --quiet -p ecod-actors --no-default-features --lib --bins
 
 words: PACKAGES := python3
-words: setup ## [check] three habits that make texts hard to read, per area; the rates may only fall
+words: setup ## [check] three habits that make texts hard to read, per area; the numbers may only fall
 	packaging/check-words
 
 # make changelog VERSION=0.2.0 writes the section and removes the fragments.
