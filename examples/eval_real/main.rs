@@ -171,7 +171,8 @@ fn folder(work: &Path, name: &str) -> anyhow::Result<PathBuf> {
     Ok(folder)
 }
 
-/// Prints the rows of a recording; returns those for `--write-table`.
+/// Prints the rows of a recording; returns those for `--write-table`: of single cameras only the best, and the
+/// detections of all cameras together only if a single observer reports.
 fn judge(program: &Path, recording: &Recording) -> anyhow::Result<String> {
     let Recording {
         name,
@@ -180,10 +181,22 @@ fn judge(program: &Path, recording: &Recording) -> anyhow::Result<String> {
         is_fused,
         ..
     } = recording;
+    let mut best_camera: Option<Vec<String>> = None;
     let mut written = String::new();
     for (method, maps) in others {
-        let cells = row(name, method, false, &eval(program, recording, maps)?);
-        written += &written_row(&cells);
+        let mut cells = row(name, method, false, &eval(program, recording, maps)?);
+        if let Some(number) = method.strip_prefix("camera ") {
+            cells[1] = format!("best camera ({number})");
+            let is_better = |best: &Vec<String>| moda(&cells) > moda(best);
+            if best_camera.as_ref().is_none_or(is_better) {
+                best_camera = Some(cells);
+            }
+        } else if !is_fused || method != "detections" {
+            written += &written_row(&cells);
+        }
+    }
+    if let Some(cells) = best_camera {
+        written.insert_str(0, &written_row(&cells));
     }
     let maps = reports.with_file_name("maps.jsonl");
     let replay = || {
@@ -271,6 +284,17 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) -> Vec<String>
     let cells: Vec<String> = names.into_iter().chain(figures).collect();
     println!("| {} |", cells.join(" | "));
     cells
+}
+
+/// The column `MODA@1` of a row; 0 without it.
+fn moda(cells: &[String]) -> f64 {
+    let figure = COLUMNS
+        .iter()
+        .zip(cells)
+        .find(|(column, _)| **column == "MODA@1");
+    figure
+        .and_then(|(_, cell)| cell.parse().ok())
+        .unwrap_or_default()
 }
 
 /// The cells of the columns [`WRITTEN`] as a row.
