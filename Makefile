@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check tables-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks renewal soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed compare results-check tables-check eval-labels compare-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials trials-and-attacks joining clocks renewal soak attack lint other-features doc audit bench core-only fuzz instructions rooms snapshots code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 # A target that `make help` lists has its group in square brackets.
 help:
@@ -154,6 +154,11 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 
 renewal: setup ## a cell of real nodes whose certificates of three minutes are renewed twice: gaps of its maps
 	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice --nocapture
+
+# For .ci/run. Both take the variables of their own targets.
+trials-and-attacks: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
+trials-and-attacks: setup ## make trials and make attack by one program
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact failover::trials attacks::attacks --nocapture --test-threads 1
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1
