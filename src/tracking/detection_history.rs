@@ -39,6 +39,7 @@ impl DetectionHistory {
         self.slot_of(sensor).map(|slot| &self.histories[slot])
     }
 
+    /// The history of a vehicle, if it has a slot.
     pub(super) fn get_mut(&mut self, sensor: SensorId) -> Option<&mut SensorHistory> {
         self.slot_of(sensor).map(|slot| &mut self.histories[slot])
     }

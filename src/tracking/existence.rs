@@ -229,7 +229,7 @@ pub(super) struct SensorHistory {
     pub(super) state: ObservationState,
     pub(super) observed_at: Timestamp,
     pub(super) last_hit: Option<Timestamp>,
-    /// The last detection that confirmed the track.
+    /// Time of the last detection that confirmed the track.
     pub(super) confirmed_at: Option<Timestamp>,
     /// Corrected position of the last detection, metres.
     pub(super) position: Vector2<f64>,
