@@ -23,6 +23,9 @@ T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[3]
 
+# Seconds until anything that must happen has happened, also where other work leaves a test a few percent of a processor.
+SOON = 90.0
+
 
 def free_port() -> int:
     """A port below those that the system gives to clients: one of these could take it before the server, even our own probe."""
@@ -34,7 +37,7 @@ def free_port() -> int:
             return port
 
 
-def wait_for(condition: Callable[[], Any], timeout: float = 20.0) -> Any:
+def wait_for(condition: Callable[[], Any], timeout: float = SOON) -> Any:
     """What the condition gives, as soon as that is something."""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
@@ -45,7 +48,7 @@ def wait_for(condition: Callable[[], Any], timeout: float = 20.0) -> Any:
     raise AssertionError("it did not come true in time")
 
 
-def until(messages: Iterable[T], condition: Callable[[T], Any], timeout: float = 20.0) -> T:
+def until(messages: Iterable[T], condition: Callable[[T], Any], timeout: float = SOON) -> T:
     """The first of the messages for which the condition holds."""
     deadline = time.monotonic() + timeout
     for message in messages:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import supervision
-from conftest import Server, until
+from conftest import SOON, Server, until
 from test_cell import cell, heard  # noqa: F401, fixtures
 
 import ecod
@@ -32,7 +32,7 @@ def test_boxes_of_a_program_are_on_the_map_of_a_node(edge: Callable[..., Server]
             cell.report_boxes([PERSON], camera=CAMERA, mount=mount, pose=vehicle)
             return map.landmarks[0].label == "person"
 
-        place = until(cell.maps(timeout=20), shows_the_person).landmarks[0]
+        place = until(cell.maps(timeout=SOON), shows_the_person).landmarks[0]
         assert place.contributors == ["euclid"]
         assert (place.x_m, place.y_m) == pytest.approx((0.0, 0.0), abs=0.4)
         assert not cell.counts, cell.counts
@@ -43,7 +43,7 @@ def test_a_node_refuses_what_the_client_does_not_check(edge: Callable[..., Serve
     with ecod.Cell(node.address, cell_name, node="euclid") as cell:  # noqa: F811
         wide = ecod.Camera(1000, 1000, horizontal_fov_deg=400)
         with pytest.raises(ecod.Refused, match="camera.horizontal_fov_deg: is 400, and must be a number from 1 to 175"):
-            for _ in cell.maps(timeout=20):
+            for _ in cell.maps(timeout=SOON):
                 cell.report_boxes([], camera=wide, pose=(0, 0, 0))
 
 
@@ -81,7 +81,7 @@ def test_headings_in_degrees_are_refused_by_name(cell: ecod.Cell, heard: queue.Q
         pose = ecod.Pose.from_compass(1.0, 6.0, azimuth_deg)
         assert math.cos(pose.heading_rad - heading_rad) == pytest.approx(1.0), azimuth_deg
         cell.report([], pose=pose)
-        assert heard.get(timeout=10)[1]["pose"]["heading_rad"] == pose.heading_rad
+        assert heard.get(timeout=SOON)[1]["pose"]["heading_rad"] == pose.heading_rad
     with pytest.raises(ecod.Invalid, match="azimuth_deg: 400"):
         ecod.Pose.from_compass(0, 0, 400)
 

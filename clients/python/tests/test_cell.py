@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Publisher, Server, free_port, wait_for
+from conftest import SOON, Publisher, Server, free_port, wait_for
 from test_codec import MAP
 
 import ecod
@@ -60,7 +60,7 @@ def heard(publisher: Publisher) -> queue.Queue[tuple[str, dict[str, Any]]]:
 
 def listen(cell: ecod.Cell, publisher: Publisher) -> Iterator[ecod.GlobalMap]:
     """The maps of a cell, once the broker sends them."""
-    maps = cell.maps(timeout=20)
+    maps = cell.maps(timeout=SOON)
     rounds = iter(range(1, 10_000))
     wait_for(lambda: publisher.say("global_detections", map_of(0, next(rounds))) or cell._maps.number)
     publisher.say("global_detections", map_of(0, 10_000))
@@ -100,7 +100,7 @@ def test_a_cell_that_begins_anew_is_heard_after_a_silence(
 
 
 def test_a_slow_reader_gets_the_newest_map_and_keeps_nothing_else(cell: ecod.Cell, publisher: Publisher) -> None:
-    slow, quick = listen(cell, publisher), cell.maps(timeout=20)
+    slow, quick = listen(cell, publisher), cell.maps(timeout=SOON)
     for round in range(1, 201):
         publisher.say("global_detections", map_of(1, round))
     wait_for(lambda: cell._maps._last == (1, "edge", 200))
@@ -113,7 +113,7 @@ def test_a_slow_reader_gets_the_newest_map_and_keeps_nothing_else(cell: ecod.Cel
 def test_unusable_messages_are_counted_and_told_of_once(
     cell: ecod.Cell, publisher: Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    statuses = cell.statuses(timeout=20)
+    statuses = cell.statuses(timeout=SOON)
     maps = listen(cell, publisher)  # The broker answers in order: it sends statuses, too.
     for payload in [b"{", b'{"schema":1}', b"\x00", b"\xec" + bytes(32), json.dumps({**MAP, "schema": 2}).encode(), b"[" * 9999] * 3:
         publisher.say("global_detections", payload)
@@ -133,11 +133,11 @@ def test_statuses_are_the_present_ones_first_and_then_changes(
 ) -> None:
     for node in ("gauss", "riemann"):
         publisher.say(f"nodes/{node}", status(node), retain=True)
-    first = cell.statuses(timeout=20)
+    first = cell.statuses(timeout=SOON)
     assert {next(first).node, next(first).node} == {"gauss", "riemann"}
     publisher.say("nodes/gauss", status("gauss", "offline"))
     assert next(first).state == "offline"
-    again = cell.statuses(timeout=20)
+    again = cell.statuses(timeout=SOON)
     assert [(it.node, it.state) for it in (next(again), next(again))] == [("riemann", "following"), ("gauss", "offline")]
     monkeypatch.setattr(streams, "MAX_NODES", 5)
     for number in range(20):
@@ -154,10 +154,10 @@ def test_statuses_are_the_present_ones_first_and_then_changes(
 def test_verdicts_and_reputations_are_read(cell: ecod.Cell, publisher: Publisher) -> None:
     reputations = {"schema": 1, "epoch": 3, "round": 88, "reputations": {"euclid": {"score": 0.62, "correct": 410, "incorrect": 22}}}
     publisher.say("reputations", json.dumps(reputations).encode(), retain=True)
-    assert next(cell.reputations(timeout=20)).reputations["euclid"].correct == 410
+    assert next(cell.reputations(timeout=SOON)).reputations["euclid"].correct == 410
     verdict = {"landmark": "ball", "label": None, "score": 0, "margin": 0, "votes": {"cup": 0.12}, "contributors": ["euclid"]}
     verdicts = {"schema": 1, "aggregator": "edge", "epoch": 3, "round": 8, "fused_at_us": 1_500_000, "verdicts": [verdict]}
-    rounds = cell.verdicts(timeout=20)
+    rounds = cell.verdicts(timeout=SOON)
 
     def say() -> int:
         verdicts["round"] = int(str(verdicts["round"])) + 1
@@ -176,7 +176,7 @@ def test_reports_and_votes_are_published_under_the_name_of_the_part(cell: ecod.C
     assert cell.report([], captured_at=1795239884.987159)
     moment = datetime(2026, 11, 21, 6, 44, 44, 987159, timezone(timedelta(hours=1)))
     assert cell.vote([{"label": "car", "confidence": 1, "x_m": 0, "y_m": 0, "landmark": "slot-0"}], captured_at=moment)
-    (topic, first), (_, second), (vote_topic, vote) = (heard.get(timeout=20) for _ in range(3))
+    (topic, first), (_, second), (vote_topic, vote) = (heard.get(timeout=SOON) for _ in range(3))
     assert (topic, vote_topic) == (
         f"ecod/v1/{cell_name}/detections/euclid--lidar",
         f"ecod/v1/{cell_name}/vote_detections/euclid--lidar",
@@ -202,7 +202,7 @@ def test_values_that_are_not_allowed_are_not_sent_and_cost_no_number(cell: ecod.
         with pytest.raises(ecod.Invalid, match=f"not sent: .*{text}|not sent: {text}"):
             send()
     assert cell.report([CAR])
-    assert heard.get(timeout=20)[1]["seq"] == 1
+    assert heard.get(timeout=SOON)[1]["seq"] == 1
 
 
 def test_arguments_of_the_wrong_shape_are_not_sent(cell: ecod.Cell) -> None:
@@ -261,7 +261,7 @@ def test_arguments_that_cannot_be_meant_are_refused(text: str, named: dict[str, 
 def test_the_connection_is_made_anew_after_the_broker_is_killed(
     cell: ecod.Cell, broker: Server, cell_name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    maps, statuses = cell.maps(timeout=30), cell.statuses(timeout=30)
+    maps, statuses = cell.maps(timeout=SOON), cell.statuses(timeout=SOON)
     assert cell.report([CAR])
     broker.kill()
     wait_for(lambda: not cell.report([CAR]))
@@ -282,7 +282,7 @@ def test_the_connection_is_made_anew_after_the_broker_is_killed(
 
 def test_a_broker_that_stands_still_gets_no_late_reports(cell: ecod.Cell, broker: Server, heard: Any) -> None:
     assert cell.report([CAR])
-    heard.get(timeout=20)
+    heard.get(timeout=SOON)
     os.kill(broker.process.pid, signal.SIGSTOP)
     try:
         # 200 KB each: the kernel takes some, the client sixteen.
@@ -358,7 +358,7 @@ def test_a_subscription_that_is_refused_is_raised() -> None:
     peer = Peer(ACCEPTED, b"\x90\x04\x00\x01\x00\x87")
     with ecod.Cell(peer.address, "lot-1") as cell:
         with pytest.raises(ecod.Refused, match=f"{peer.address} refuses ecod/v1/lot-1/global_detections: Not authorized"):
-            next(cell.maps(timeout=20))
+            next(cell.maps(timeout=SOON))
     peer.listener.close()
 
 
@@ -417,7 +417,7 @@ def test_closing_ends_the_loops_of_other_threads(broker: Server) -> None:
     reader = threading.Thread(target=lambda: got.extend(cell.maps()))
     reader.start()
     cell.close()
-    reader.join(timeout=10)
+    reader.join(timeout=SOON)
     assert not reader.is_alive() and got == [] and not cell.report([])
     cell.close()
 
@@ -426,4 +426,4 @@ def test_closing_ends_the_loops_of_other_threads(broker: Server) -> None:
 def test_what_was_reported_before_closing_arrives(broker: Server, cell_name: str, heard: Any, _again: int) -> None:
     with ecod.Cell(broker.address, cell_name) as cell:
         assert all(cell.report([CAR] * 200) for _ in range(10))
-    assert [heard.get(timeout=20)[1]["seq"] for _ in range(10)] == list(range(1, 11))
+    assert [heard.get(timeout=SOON)[1]["seq"] for _ in range(10)] == list(range(1, 11))

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from conftest import ROOT, Server
+from conftest import ROOT, SOON, Server
 from test_node import pki  # noqa: F401, a fixture
 
 import ecod
@@ -57,17 +57,17 @@ def test_a_documented_program_does_what_it_says(
         if is_endless and "cell.report" in text:
             with ecod.Cell(node.address, cell_name) as cell:
                 began = time.monotonic()
-                for map in cell.maps(timeout=20):
+                for map in cell.maps(timeout=SOON):
                     if any("euclid" in thing.contributors for thing in map.objects):
                         break
                     assert process.poll() is None, process.communicate()
-                    assert time.monotonic() - began < 20, "its report is not on the map"
+                    assert time.monotonic() - began < SOON, "its report is not on the map"
         elif is_endless:
             assert process.stdout is not None
             line = process.stdout.readline()
             assert re.match(r"\d+ \[", line), (line, process.poll() is not None and process.communicate())
         else:
-            said = process.communicate(timeout=20)
+            said = process.communicate(timeout=SOON)
             assert process.returncode == 0, said
     finally:
         process.kill()

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import Server, until, wait_for
+from conftest import SOON, Server, until, wait_for
 from test_cell import passwords
 from test_codec import MAP
 from test_node import pki  # noqa: F401, a fixture
@@ -55,7 +55,7 @@ def feed(broker: str, *arguments: str, cell: str = "lot-1", lines: list[str]) ->
                 process.stdin.write(line + "\n")
                 process.stdin.flush()
                 time.sleep(0.1)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=SOON)
         return process.returncode, out + err
 
 
@@ -79,7 +79,7 @@ def test_a_detector_may_run_without_a_pose() -> None:
 def leads(edge: Server, cell_name: str, **settings: Any) -> None:
     """Waits for the edge's first map."""
     with ecod.Cell(edge.address, cell_name, **settings) as cell:
-        next(cell.maps(timeout=20))
+        next(cell.maps(timeout=SOON))
 
 
 def was_fed(code: int, said: str) -> bool:
@@ -150,11 +150,11 @@ def test_the_planner_brakes_for_an_object_ahead_and_without_maps(edge: Callable[
 
                 return report
 
-            until(own.maps(timeout=20), seen_at(25.0))
+            until(own.maps(timeout=SOON), seen_at(25.0))
             near = seen_at(15.0)
-            until(own.maps(timeout=20), lambda map: near(map) and any(line.startswith("BRAKE: an object is 1") for line in said))
+            until(own.maps(timeout=SOON), lambda map: near(map) and any(line.startswith("BRAKE: an object is 1") for line in said))
             # The object goes away, and then the edge.
-            until(own.maps(timeout=20), seen_at(60.0))
+            until(own.maps(timeout=SOON), seen_at(60.0))
             wait_for(lambda: own.report([], pose=(0.5, 0.0, 0.0)) and said[-1].startswith("GO"))
         node.kill()
         wait_for(lambda: said[-1] == "BRAKE: no map for 0.5 s\n")
@@ -233,9 +233,9 @@ def test_yolo_reports_what_it_sees(edge: Callable[..., Server], cell_name: str, 
             assert yolo.poll() in (None, 0), yolo.communicate()
             return sum(not thing.vehicle for thing in map.objects) == 2
 
-        map = until(cell.maps(timeout=30), are_there)
+        map = until(cell.maps(timeout=SOON), are_there)
         cars = sorted((thing for thing in map.objects if not thing.vehicle), key=lambda thing: thing.x_m)
         assert [(car.label, car.contributors) for car in cars] == [("car", ["euclid"])] * 2
         assert [(car.x_m, car.y_m) for car in cars] == [pytest.approx(at, abs=0.1) for at in ((1.0, 3.0), (4.5, 9.0))]
-        said = yolo.communicate(timeout=30)
+        said = yolo.communicate(timeout=SOON)
         assert yolo.returncode == 0, said
