@@ -1,6 +1,7 @@
 //! Topics and filters that would take the broker's stack or memory.
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::time::Duration;
 
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
@@ -106,6 +107,41 @@ async fn subscriptions_without_number_are_refused() {
     }
     subscribe(&mut stream, "one/more", &SUBACK_FAILURE).await;
     cell.honest_traffic_goes_on().await;
+}
+
+/// The broker sends a client one copy of a message per filter that matches the topic.
+#[tokio::test]
+async fn overlapping_filters_have_limit() {
+    let mut cell = Cell::start().await;
+    let mut stream = secure(&mut cell).await;
+    ask(&mut stream, &login(None), &CONNACK).await;
+    let levels = ["ecod", "v1", "lot", "detections", "euclid"];
+    let mut filters = Vec::new();
+    for mask in 1..1 << levels.len() {
+        let filter: Vec<_> = (0..levels.len())
+            .map(|level| match mask >> level & 1 {
+                1 => "+",
+                _ => levels[level],
+            })
+            .collect();
+        filters.extend(text(&filter.join("/")));
+        filters.push(0);
+    }
+    let request = packet(0x82, &[&[0, 1], &filters]);
+    ask(&mut stream, &request, &[0x90, 33, 0, 1]).await;
+    let mut granted = [0; 31];
+    stream.read_exact(&mut granted).await.unwrap();
+    cell.honest_traffic_goes_on().await;
+    let mut received = Vec::new();
+    let mut chunk = [0; 4096];
+    while let Ok(count) = timeout(Duration::from_millis(500), stream.read(&mut chunk)).await {
+        received.extend_from_slice(&chunk[..count.unwrap()]);
+    }
+    let copies = received
+        .windows(b"report 1".len())
+        .filter(|window| window == b"report 1")
+        .count();
+    assert!((1..=9).contains(&copies), "{copies} copies of a report");
 }
 
 #[tokio::test]

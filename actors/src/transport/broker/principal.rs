@@ -223,6 +223,20 @@ impl PrincipalRegistry {
         own.map(|connection| connection.subscriptions.len()).sum()
     }
 
+    /// Number of filters of one connection for which `is_counted` holds.
+    pub(super) fn count_filters(
+        &self,
+        address: Option<SocketAddr>,
+        is_counted: impl Fn(&str) -> bool,
+    ) -> usize {
+        let connections = self.connections();
+        let connection = address.and_then(|address| connections.get(&address));
+        connection.map_or(0, |connection| {
+            let filters = connection.subscriptions.iter();
+            filters.filter(|filter| is_counted(filter)).count()
+        })
+    }
+
     fn connections(&self) -> RwLockReadGuard<'_, HashMap<SocketAddr, Registered>> {
         self.0.read().unwrap_or_else(PoisonError::into_inner)
     }
