@@ -233,15 +233,11 @@ impl<'a> Assignment<'a> {
             });
         for (number, detection) in likely.take(MAX_FAST) {
             let reach_m = detection.class.max_speed_mps * FAST_WITHIN.as_secs_f64();
-            let mut near: SmallVec<[TrackIndex; 4]> = SmallVec::new();
-            self.tracks.near(
+            let near = self.nearest_tracks(
                 &detection.measurement.position,
                 reach_m + self.tracks.slack_m(self.at),
-                |indexed| {
-                    if self.tracks[indexed.track].may_have_any_velocity() {
-                        near.push(indexed.track);
-                    }
-                },
+                MAX_TRACKS_NEAR,
+                |track| self.tracks[track].may_have_any_velocity(),
             );
             for track in near {
                 let hypothesis = self.of_track(track);
@@ -300,23 +296,12 @@ impl<'a> Assignment<'a> {
         let mut pairs = Vec::with_capacity(2 * scan.detections.len());
         for (number, detection) in scan.detections.iter().enumerate() {
             let position = &detection.measurement.position;
-            let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
-            self.tracks.near(position, reach_m, |indexed| {
-                if Some(indexed.track) != own_track {
-                    tracks.push(((indexed.position - position).norm(), indexed.track));
-                }
+            let tracks = self.nearest_tracks(position, reach_m, max_near, |track| {
+                Some(track) != own_track
             });
-            if tracks.len() > max_near {
-                let by_distance = |a: &(f64, TrackIndex), b: &(f64, TrackIndex)| {
-                    a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
-                };
-                tracks.select_nth_unstable_by(max_near, by_distance);
-                tracks.truncate(max_near);
-                tracks.sort_unstable_by(by_distance);
-            }
             let mut near: SmallVec<[usize; 16]> = tracks
                 .into_iter()
-                .map(|(_, track)| self.of_track(track))
+                .map(|track| self.of_track(track))
                 .collect();
             self.new_near(position, &mut near);
             let Some(sensor) = self.sensors.get(scan.sensor).filter(|_| !near.is_empty()) else {
@@ -334,6 +319,32 @@ impl<'a> Assignment<'a> {
             }
         }
         pairs
+    }
+
+    /// Tracks within `reach_m` of a position for which `is_candidate` holds: of more than `max`, the
+    /// nearest.
+    fn nearest_tracks(
+        &self,
+        position: &Vector2<f64>,
+        reach_m: f64,
+        max: usize,
+        is_candidate: impl Fn(TrackIndex) -> bool,
+    ) -> SmallVec<[TrackIndex; 16]> {
+        let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
+        self.tracks.near(position, reach_m, |indexed| {
+            if is_candidate(indexed.track) {
+                tracks.push(((indexed.position - position).norm(), indexed.track));
+            }
+        });
+        if tracks.len() > max {
+            let by_distance = |a: &(f64, TrackIndex), b: &(f64, TrackIndex)| {
+                a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))
+            };
+            tracks.select_nth_unstable_by(max, by_distance);
+            tracks.truncate(max);
+            tracks.sort_unstable_by(by_distance);
+        }
+        tracks.into_iter().map(|(_, track)| track).collect()
     }
 
     /// Log-likelihood ratio of a pair, greater than 0; `None` if clutter or a new object explains the detection better.

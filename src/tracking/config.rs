@@ -78,7 +78,8 @@ pub struct TracksConfig {
     /// Maximum number of objects; those that only one vehicle has detected take at most an eighth.
     /// Default 20000.
     pub max_tracks: usize,
-    /// Maximum number of objects in a square with `gate_m` as side. Default 16: reports cannot claim more in an area.
+    /// Maximum number of objects that one vehicle alone detects in a square with `gate_m` as side.
+    /// Default 16. A square has room for twice as many objects in all.
     pub max_density: usize,
 }
 

@@ -161,19 +161,22 @@ impl TrackGrid {
             .insert(&track, self.square_m);
     }
 
-    /// Number of tracks in the square around a position.
-    pub(super) fn crowd(&self, position: &Vector2<f64>) -> usize {
+    /// Tracks in the square around a position.
+    pub(super) fn crowd(&self, position: &Vector2<f64>) -> SmallVec<[TrackIndex; 16]> {
         let Some(cell) = self.cells.get(&square(position, self.cell_m)) else {
-            return 0;
+            return SmallVec::new();
         };
         let here = square(position, self.square_m);
+        let track = |place: usize| cell.tracks[place].0;
         if cell.squares.is_empty() {
-            let positions = cell.positions.iter();
+            let positions = cell.positions.iter().enumerate();
             positions
-                .filter(|other| square(other, self.square_m) == here)
-                .count()
+                .filter(|(_, other)| square(other, self.square_m) == here)
+                .map(|(place, _)| track(place))
+                .collect()
         } else {
-            cell.squares.get(&here).map_or(0, SmallVec::len)
+            let places = cell.squares.get(&here).into_iter().flatten();
+            places.map(|place| track(*place as usize)).collect()
         }
     }
 
@@ -265,7 +268,7 @@ mod tests {
             }
             let here = square(centre, 4.0);
             let around = places.iter().filter(|place| square(place, 4.0) == here);
-            assert_eq!(grid.crowd(centre), around.count());
+            assert_eq!(grid.crowd(centre).len(), around.count());
         }
     }
 }

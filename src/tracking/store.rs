@@ -34,6 +34,9 @@ pub(super) struct TrackStore {
 /// The store has this many shares. The sole tracks of one vehicle use at most one share.
 const SHARES: usize = 8;
 
+/// A square has room for this many times `max_density`, which limits the sole tracks of one vehicle.
+const SQUARE_SHARES: usize = 2;
+
 impl TrackStore {
     pub(super) fn new(config: &TracksConfig) -> Self {
         let TracksConfig {
@@ -97,10 +100,9 @@ impl TrackStore {
     /// Adds a track unless the store, the place or the share of the vehicle that alone has detected
     /// the object is full.
     pub(super) fn add(&mut self, track: Track) -> Option<TrackIndex> {
-        let crowd = self.grid.crowd(&track.state.position);
         let of_spawner = track.spawned_by.and_then(|vehicle| self.sole.get(&vehicle));
         let has_share = of_spawner.is_none_or(|tracks| *tracks < self.max_tracks.div_ceil(SHARES));
-        if self.tracks.len() >= self.max_tracks || crowd >= self.max_density || !has_share {
+        if self.tracks.len() >= self.max_tracks || !has_share || self.is_crowded_for(&track) {
             self.refused += 1;
             return None;
         }
@@ -112,6 +114,19 @@ impl TrackStore {
         self.tracks.push(track);
         self.record_speed(index);
         Some(index)
+    }
+
+    /// True if the square around a new track is full, or full of sole tracks of the vehicle that began
+    /// the new one.
+    fn is_crowded_for(&self, track: &Track) -> bool {
+        let crowd = self.grid.crowd(&track.state.position);
+        let is_sole_of_spawner = |other: &&TrackIndex| {
+            let other = &self[**other];
+            track.spawned_by.is_some() && other.spawned_by == track.spawned_by && other.is_sole()
+        };
+        crowd.len() >= self.max_density
+            && (crowd.len() >= SQUARE_SHARES * self.max_density
+                || crowd.iter().filter(is_sole_of_spawner).count() >= self.max_density)
     }
 
     /// Indexes all tracks by their positions at `at`.
