@@ -10,6 +10,7 @@
 //! spawn or maintain tracks. The last map of another aggregator of this cell spawns tracks whose existence fades.
 
 mod assignment;
+mod attributes;
 mod calibration;
 mod class;
 mod config;

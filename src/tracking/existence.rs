@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use nalgebra::Vector2;
 
+use super::attributes::StatedAttributes;
 use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
@@ -238,6 +239,8 @@ pub(super) struct SensorHistory {
     is_view_known: bool,
     /// True if the position of the last detection was wrong by more than the vehicle states.
     pub(super) is_shifted: bool,
+    /// Label, heading and size that the vehicle states.
+    pub(super) attributes: StatedAttributes,
     /// Detections and observations since the last judgement.
     unjudged: ExistenceStatement,
     judged_at: Timestamp,
@@ -270,6 +273,7 @@ impl SensorHistory {
             observations: 0,
             is_view_known: false,
             is_shifted: false,
+            attributes: StatedAttributes::default(),
             unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,

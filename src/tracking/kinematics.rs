@@ -181,6 +181,27 @@ impl KinematicState {
         self.joseph([self.pv, self.vv], gains, &noise);
     }
 
+    /// True if a velocity stated at `at` is possible for the class, and if its normalised distance from
+    /// the velocity of the state is within `gate`.
+    pub(super) fn admits_velocity(
+        &self,
+        at: Timestamp,
+        velocity: &Vector2<f64>,
+        sigma_mps: f64,
+        gate: f64,
+    ) -> bool {
+        let drift = self.class.acceleration_density() * self.seconds_to(at).abs();
+        let noise = self.vv + Matrix2::identity() * (sigma_mps * sigma_mps + drift);
+        let offset = velocity - self.velocity;
+        let distance_squared = inverse(&noise).map(|inverse| offset.dot(&(inverse * offset)));
+        self.is_possible(velocity) && distance_squared.is_some_and(|squared| squared <= gate)
+    }
+
+    /// True if objects of the class can have this velocity.
+    pub(super) fn is_possible(&self, velocity: &Vector2<f64>) -> bool {
+        velocity.norm() <= self.class.max_speed_mps
+    }
+
     /// Joseph's form of the covariance update, for any gain.
     ///
     /// `cross` is the covariance of the state with the measured quantity, `noise` the covariance of the innovation.

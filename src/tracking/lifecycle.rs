@@ -11,7 +11,6 @@ use super::config::TracksConfig;
 use super::existence::{ObservationState, SensorHistory};
 use super::handles::TrackIndex;
 use super::kinematics::{Measurement, VELOCITY_SIGMA_MPS};
-use super::population::Population;
 use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::track::Track;
@@ -111,7 +110,6 @@ fn may_be_one(track: &Track, other: &Track, now: Timestamp, config: &TracksConfi
 pub(super) fn prune(
     tracks: &mut TrackStore,
     sensors: &mut Sensors,
-    population: &mut Population,
     now: Timestamp,
     config: &TracksConfig,
 ) {
@@ -124,10 +122,10 @@ pub(super) fn prune(
             unseen <= life && track.existence.probability() >= MIN_EXISTENCE
         };
         if !is_kept {
-            if track.is_settled {
-                population.leave();
-            } else {
+            if !track.is_settled {
                 sensors.settle(track.spawned_by, false);
+            } else if let Some(sensor) = track.spawned_by.and_then(|id| sensors.get_mut(id)) {
+                sensor.population.leave();
             }
         }
         is_kept

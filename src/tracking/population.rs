@@ -46,7 +46,7 @@ impl Births {
     }
 }
 
-/// The time for which objects stay in the cell.
+/// The time for which the objects of one vehicle stay in the cell.
 #[derive(Debug, Clone)]
 pub(super) struct Population {
     departures: f64,
@@ -57,15 +57,15 @@ pub(super) struct Population {
 impl Default for Population {
     fn default() -> Self {
         Self {
-            departures: Self::USUAL_TIME_S / Self::USUAL_STAY_S,
+            departures: Self::USUAL_TIME_S * Self::USUAL_LEAVING_HZ,
             stayed_s: Self::USUAL_TIME_S,
         }
     }
 }
 
 impl Population {
-    /// Usual stay of an object in seconds.
-    const USUAL_STAY_S: f64 = 15.0;
+    /// Usual rate at which objects leave, per second.
+    pub(super) const USUAL_LEAVING_HZ: f64 = 1.0 / 15.0;
 
     /// Time in seconds as which the usual stay counts.
     const USUAL_TIME_S: f64 = 60.0;

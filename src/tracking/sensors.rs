@@ -9,9 +9,10 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
+use super::detection_history::DetectionHistory;
 use super::existence::{DetectionRates, ObservationRates, ObservationState};
 use super::handles::SensorId;
-use super::population::Births;
+use super::population::{Births, Population};
 use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::names::NodeName;
@@ -155,6 +156,18 @@ impl Sensors {
         }
     }
 
+    /// Rate at which an object leaves, per second: the lowest rate of the vehicles that have detected
+    /// it, so that the invented objects of one vehicle do not raise the rate for the objects of others.
+    pub(super) fn leaving_hz(&self, history: &DetectionHistory) -> f64 {
+        history
+            .iter()
+            .filter(|history| history.last_hit.is_some())
+            .filter_map(|history| self.get(history.sensor))
+            .map(|sensor| sensor.population.leaving_hz())
+            .min_by(f64::total_cmp)
+            .unwrap_or(Population::USUAL_LEAVING_HZ)
+    }
+
     /// Sets the pose biases of all vehicles to zero.
     pub(super) fn reset_pose_biases(&mut self, at: Timestamp, config: &TracksConfig) {
         for sensor in self.iter_mut() {
@@ -196,6 +209,8 @@ pub(super) struct SensorModel {
     pub(super) coverage: Coverage,
     pub(super) clutter: DetectionRates,
     pub(super) births: Births,
+    /// Time for which the objects stay whose tracks the vehicle began.
+    pub(super) population: Population,
     pub(super) counts: TrustCounts,
 }
 
@@ -219,6 +234,7 @@ impl SensorModel {
             coverage: Coverage::default(),
             clutter: DetectionRates::clutter(),
             births: Births::default(),
+            population: Population::default(),
             counts,
         }
     }

@@ -3,6 +3,7 @@ mod beside;
 mod crowd;
 mod fast;
 mod fixed;
+mod malicious;
 mod neighbour_tracks;
 mod passing;
 mod shifted;

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use nalgebra::Vector2;
-use smallvec::SmallVec;
 use uuid::Uuid;
 
+use super::attributes::{self, LabelWeights};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
@@ -14,8 +14,9 @@ use super::existence::{Existence, SensorHistory, logistic};
 use super::grid::IndexedTrack;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
+use super::population::Population;
 use super::twins::Twins;
-use crate::model::geometry::{Covariance, wrap_angle};
+use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
@@ -23,8 +24,8 @@ use crate::wire::{FusedObject, PerceivedObject};
 /// Maximum age of another vehicle's detection that confirms a track.
 const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
 
-/// Maximum number of labels of a track; the most likely labels are kept.
-const MAX_LABELS: usize = 8;
+/// Share of the weight of labels from another aggregator's map that remains after an instant with a detection.
+const INHERITED_KEPT: f64 = 0.95;
 
 /// Similarity to a label without any reading.
 pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
@@ -63,8 +64,10 @@ pub(super) struct Track {
     pub(super) id: Uuid,
     pub(super) state: KinematicState,
     pub(super) history: DetectionHistory,
-    /// Fading weights of the labels that were read.
-    labels: SmallVec<[(Label, f64); 1]>,
+    /// Weights of the labels that vehicles stated.
+    labels: LabelWeights,
+    /// Labels from another aggregator's map, which fade.
+    inherited_labels: LabelWeights,
     /// Direction that vehicles stated.
     heading_rad: Option<f64>,
     /// Direction from another aggregator's map, which may be outdated; used until this aggregator has estimated a
@@ -75,6 +78,8 @@ pub(super) struct Track {
     pub(super) last_seen: Timestamp,
     /// Existence from all observations.
     pub(super) existence: Existence,
+    /// Rate at which the object leaves, per second.
+    pub(super) leaving_hz: f64,
     /// True if the last observation of any vehicle was a detection.
     is_detected: bool,
     /// The vehicle whose detection began the track.
@@ -101,13 +106,15 @@ impl Track {
             id,
             state: KinematicState::new(at, measurement, class),
             history: DetectionHistory::default(),
-            labels: SmallVec::new(),
+            labels: LabelWeights::new(),
+            inherited_labels: LabelWeights::new(),
             heading_rad: None,
             inherited_heading_rad: None,
             size_m: None,
             first_seen: at,
             last_seen: at,
             existence: Existence::new(f64::NEG_INFINITY, at),
+            leaving_hz: Population::USUAL_LEAVING_HZ,
             is_detected: true,
             spawned_by: None,
             is_settled: false,
@@ -127,36 +134,35 @@ impl Track {
         }
     }
 
-    /// Updates labels, heading and size from a detection.
-    pub(super) fn update_attributes(&mut self, object: &PerceivedObject, heading_rad: Option<f64>) {
-        const KEPT: f64 = 0.95;
-        const SHARE: f64 = 0.3;
-        self.labels
-            .iter_mut()
-            .for_each(|(_, weight)| *weight *= KEPT);
-        let label = [(&object.label, object.confidence)];
-        let scores = object.scores.iter().map(|(label, score)| (label, *score));
-        let has_no_scores = object.scores.is_empty();
-        for (label, score) in scores.chain(label.into_iter().filter(|_| has_no_scores)) {
-            match self.labels.iter_mut().find(|(known, _)| known == label) {
-                Some((_, weight)) => *weight += score,
-                None => self.labels.push((label.clone(), score)),
-            }
+    /// Records a vehicle's statement of label, heading and size; [`Self::combine_attributes`] applies it.
+    pub(super) fn record_attributes(
+        &mut self,
+        sensor: SensorId,
+        object: &PerceivedObject,
+        heading_rad: Option<f64>,
+        trust: f64,
+        at: Timestamp,
+    ) {
+        if let Some(history) = self.history.for_hit(sensor, at) {
+            history.attributes.record(object, heading_rad, trust);
         }
-        if self.labels.len() > MAX_LABELS {
-            self.labels.sort_by(|a, b| b.1.total_cmp(&a.1));
-            self.labels.truncate(MAX_LABELS);
+    }
+
+    /// Derives label, heading and size from the statements of all vehicles.
+    pub(super) fn combine_attributes(&mut self) {
+        let stated = || self.history.iter().map(|history| &history.attributes);
+        let mut labels = attributes::labels(stated());
+        let heading_rad = attributes::heading_rad(stated());
+        let size_m = attributes::size_m(stated());
+        for (label, weight) in &mut self.inherited_labels {
+            attributes::add(&mut labels, label, *weight);
+            *weight *= INHERITED_KEPT;
         }
+        self.labels = labels;
+        self.heading_rad = heading_rad.or(self.heading_rad);
+        self.size_m = size_m.or(self.size_m);
         if self.course_rad().is_some() {
             self.inherited_heading_rad = None;
-        }
-        if let Some(new) = heading_rad {
-            let old = self.heading_rad.unwrap_or(new);
-            self.heading_rad = Some(wrap_angle(old + SHARE * wrap_angle(new - old)));
-        }
-        if let Some(new) = object.size_m {
-            let old = self.size_m.unwrap_or(new);
-            self.size_m = Some([0, 1].map(|side| old[side] + SHARE * (new[side] - old[side])));
         }
     }
 
@@ -229,9 +235,10 @@ impl Track {
         self.hits >= CONFIRMED_HITS
     }
 
-    /// Predicts the existence to `at`; `leaving_hz` is the rate at which objects leave.
-    pub(super) fn predict_existence(&mut self, at: Timestamp, leaving_hz: f64) {
-        self.existence.predict(at, leaving_hz, self.is_detected);
+    /// Predicts the existence to `at`.
+    pub(super) fn predict_existence(&mut self, at: Timestamp) {
+        self.existence
+            .predict(at, self.leaving_hz, self.is_detected);
     }
 
     /// Records whether any vehicle detects the object at `at`.
@@ -243,14 +250,9 @@ impl Track {
 
     /// Probability that the object is there at `at`, from observations and confidences; `trust` returns the trust in a
     /// vehicle, 0 to 1.
-    pub(super) fn existence_at(
-        &self,
-        at: Timestamp,
-        leaving_hz: f64,
-        trust: impl Fn(SensorId) -> f64,
-    ) -> f64 {
+    pub(super) fn existence_at(&self, at: Timestamp, trust: impl Fn(SensorId) -> f64) -> f64 {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
-        let observations = self.existence.log_odds_at(at, leaving_hz, is_detected);
+        let observations = self.existence.log_odds_at(at, self.leaving_hz, is_detected);
         let mut confidences = 0.0;
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);
@@ -299,6 +301,15 @@ impl Track {
             .filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
+    /// Whether a vehicle other than `sensor` has detected the object.
+    pub(super) fn is_detected_by_others(&self, sensor: SensorId) -> bool {
+        let mut others = self
+            .history
+            .iter()
+            .filter(|history| history.sensor != sensor);
+        others.any(|history| history.last_hit.is_some())
+    }
+
     /// Whether a vehicle other than `sensor` detected the object shortly before `at`.
     pub(super) fn is_seen_by_others(&self, sensor: SensorId, at: Timestamp) -> bool {
         self.seen_by(at - CONFIRMED_WITHIN)
@@ -337,6 +348,7 @@ impl Track {
             .iter()
             .map(|(label, score)| (label.clone(), *score))
             .collect();
+        self.inherited_labels = self.labels.clone();
         self.inherited_heading_rad = object.heading_rad;
         self.size_m = object.size_m;
     }

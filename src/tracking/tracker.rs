@@ -7,7 +7,6 @@ use std::time::Duration;
 use super::config::TracksConfig;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::neighbour_tracks::NeighbourTracks;
-use super::population::Population;
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
 use super::store::TrackStore;
@@ -29,7 +28,6 @@ pub struct Tracker {
     pub(super) sensors: Sensors,
     tracks: TrackStore,
     neighbours: NeighbourTracks,
-    population: Population,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
     frame: TurningFrame,
@@ -49,7 +47,6 @@ impl Tracker {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
             neighbours: NeighbourTracks::default(),
-            population: Population::default(),
             config,
             pending: Vec::new(),
             frame: TurningFrame::default(),
@@ -192,21 +189,15 @@ impl Tracker {
             .since(self.closed_at)
             .as_secs_f64()
             .min(self.config.life_s);
-        let present = self
-            .tracks
-            .iter()
-            .filter(|track| track.is_settled)
-            .map(|track| track.existence.probability())
-            .sum::<f64>();
-        self.population.stay(present * passed_s);
+        for track in self.tracks.iter().filter(|track| track.is_settled) {
+            let spawner = track.spawned_by.and_then(|id| self.sensors.get_mut(id));
+            if let Some(sensor) = spawner {
+                let stayed_s = track.existence.probability() * passed_s;
+                sensor.population.stay(stayed_s);
+            }
+        }
         self.closed_at = self.closed_at.max(now);
-        prune(
-            &mut self.tracks,
-            &mut self.sensors,
-            &mut self.population,
-            now,
-            &self.config,
-        );
+        prune(&mut self.tracks, &mut self.sensors, now, &self.config);
         self.neighbours
             .drop_before(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
         let mut objects = self.objects(now);
@@ -261,7 +252,6 @@ impl Tracker {
                 tracks: &mut self.tracks,
                 sensors: &mut self.sensors,
                 neighbours: &mut self.neighbours,
-                population: &mut self.population,
                 at,
             };
             let reports = instant
@@ -287,7 +277,6 @@ impl Tracker {
     fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
         let fleet = &self.sensors.fleet;
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
-        let leaving_hz = self.population.leaving_hz();
         let mut published = Vec::with_capacity(self.tracks.len());
         let seen_since = now - Duration::from_secs_f64(self.config.life_s);
         for track in self
@@ -295,7 +284,7 @@ impl Tracker {
             .iter()
             .filter(|track| track.last_seen >= seen_since)
         {
-            let existence = track.existence_at(now, leaving_hz, |id| fleet.trust(id));
+            let existence = track.existence_at(now, |id| fleet.trust(id));
             let object = track.object(now, &self.config, existence, name);
             if object.confidence >= self.config.min_confidence {
                 published.push(object);

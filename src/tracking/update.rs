@@ -14,10 +14,9 @@ use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
 use super::neighbour_tracks::NeighbourTracks;
-use super::population::Population;
 use super::registration::{RegistrationFrame, RegistrationSample};
 use super::scan::{Scan, ScannedDetection};
-use super::sensors::{Residual, SensorModel, Sensors};
+use super::sensors::{Residual, Sensors};
 use super::store::TrackStore;
 use super::track::Track;
 use super::trust::Judgement;
@@ -69,7 +68,6 @@ pub(super) struct InstantUpdate<'a> {
     pub(super) tracks: &'a mut TrackStore,
     pub(super) sensors: &'a mut Sensors,
     pub(super) neighbours: &'a mut NeighbourTracks,
-    pub(super) population: &'a mut Population,
     pub(super) at: Timestamp,
 }
 
@@ -155,7 +153,6 @@ impl InstantUpdate<'_> {
             return;
         };
         self.tracks.set_vehicle(index, vehicle);
-        let leaving_hz = self.population.leaving_hz();
         let class = ObjectClass::of(&self.config.vehicle_label, self.config);
         let track = &mut self.tracks[index];
         if is_in_reach {
@@ -167,7 +164,7 @@ impl InstantUpdate<'_> {
             track.history.clear();
         }
         track.record_hit(at);
-        track.predict_existence(at, leaving_hz);
+        track.predict_existence(at);
         track.existence.raise(OWN_NATS);
         if let Some(history) = track.history.for_hit(vehicle, at) {
             history.hit(at, measurement.position, OWN_NATS, OWN_NATS);
@@ -307,6 +304,7 @@ impl InstantUpdate<'_> {
             && track.vehicle.is_none()
             && track.existence.probability() > CERTAIN;
         let predicted = track.state.covariance_at(at).trace() / 2.0;
+        let prior = track.state.clone();
         let alone = hypothesis.hits.len() == 1;
         let alone_offset = position - track.state.position_at(at);
         let innovation = track.state.innovation(at, &measurement);
@@ -314,15 +312,23 @@ impl InstantUpdate<'_> {
             track.state.adapt(innovation.distance_squared / MANOEUVRE);
         }
         track.state.update(at, &measurement);
-        for (scan, detection) in hits() {
-            if let Some(sensor) = self.sensors.get(scan.sensor).filter(|_| scan.is_trusted()) {
-                describe(track, detection, sensor, at);
+        for (scan, detection) in hits().filter(|(scan, _)| scan.is_trusted()) {
+            let Some(velocity) = velocity_stated(self.sensors, scan, detection) else {
+                continue;
+            };
+            let is_only_witness = alone && !track.is_detected_by_others(scan.sensor);
+            let is_admitted = if is_only_witness {
+                prior.is_possible(&velocity)
+            } else {
+                track.is_confirmed()
+                    && prior.admits_velocity(at, &velocity, VELOCITY_SIGMA_MPS, self.config.gate())
+            };
+            if is_admitted {
+                track
+                    .state
+                    .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
             }
         }
-        if track.vehicle.is_none() {
-            track.state.class = ObjectClass::of(&track.label(self.config), self.config);
-        }
-        track.state.limit_speed();
         track.record_hit_by(hits().map(|(scan, _)| scan.sensor), at);
         if is_known {
             let estimated = track.state.covariance_at(at).trace() / 2.0;
@@ -350,6 +356,16 @@ impl InstantUpdate<'_> {
                 }
             }
         }
+        for (scan, detection) in hits().filter(|(scan, _)| scan.is_trusted()) {
+            let heading_rad = heading_stated(self.sensors, scan, detection);
+            track.record_attributes(scan.sensor, detection.object, heading_rad, scan.trust, at);
+        }
+        track.combine_attributes();
+        track.leaving_hz = self.sensors.leaving_hz(&track.history);
+        if track.vehicle.is_none() {
+            track.state.class = ObjectClass::of(&track.label(self.config), self.config);
+        }
+        track.state.limit_speed();
         self.tracks.record_speed(index);
     }
 
@@ -361,12 +377,11 @@ impl InstantUpdate<'_> {
         evidence: &mut Vec<Evidence>,
     ) {
         let at = self.at;
-        let leaving_hz = self.population.leaving_hz();
         let mut due = Vec::new();
         for (number, observation) in observations.iter().enumerate() {
             let scan = &scans[observation.scan];
             let track = &mut self.tracks[observation.track];
-            track.predict_existence(at, leaving_hz);
+            track.predict_existence(at);
             let nats = observation.rates.nats(observation.detection.is_some());
             if observation.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
@@ -611,7 +626,8 @@ impl InstantUpdate<'_> {
                 rates.nats(true)
             };
             log_odds += scan.trust * nats;
-            describe(&mut track, detection, sensor, at);
+            let heading_rad = heading_stated(self.sensors, scan, detection);
+            track.record_attributes(scan.sensor, detection.object, heading_rad, scan.trust, at);
             if let Some(history) = track.history.for_hit(scan.sensor, at) {
                 let own_position = detection.measurement.position;
                 history.hit(at, own_position, nats, detection.confidence_nats);
@@ -636,6 +652,16 @@ impl InstantUpdate<'_> {
                 }
             }
         }
+        track.combine_attributes();
+        track.leaving_hz = self.sensors.leaving_hz(&track.history);
+        let velocity = velocity_stated(self.sensors, first, detection);
+        if let Some(velocity) = velocity.filter(|_| hits().nth(1).is_none())
+            && track.state.is_possible(&velocity)
+        {
+            track
+                .state
+                .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
+        }
         track.record_hit(at);
         let trust = hits().map(|(scan, _)| scan.trust).fold(0.0, f64::max);
         track.existence.raise(log_odds + trust.ln());
@@ -643,22 +669,24 @@ impl InstantUpdate<'_> {
     }
 }
 
-/// Updates velocity and attributes of a track by one detection.
-fn describe(
-    track: &mut Track,
+/// The velocity that a vehicle states for an object, corrected by the vehicle's pose bias, m/s.
+fn velocity_stated(
+    sensors: &Sensors,
+    scan: &Scan<'_>,
     detection: &ScannedDetection<'_>,
-    sensor: &SensorModel,
-    at: Timestamp,
-) {
-    let object = detection.object;
-    if let Some([x, y]) = object.velocity_mps {
-        let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
-        track
-            .state
-            .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
-    }
-    let heading_rad = object
-        .heading_rad
-        .map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
-    track.update_attributes(object, heading_rad);
+) -> Option<Vector2<f64>> {
+    let [x, y] = detection.object.velocity_mps?;
+    let bias = &sensors.get(scan.sensor)?.pose_bias;
+    Some(bias.correct_velocity(&Vector2::new(x, y)))
+}
+
+/// The heading that a vehicle states for an object, corrected by the vehicle's pose bias, radians.
+fn heading_stated(
+    sensors: &Sensors,
+    scan: &Scan<'_>,
+    detection: &ScannedDetection<'_>,
+) -> Option<f64> {
+    let heading_rad = detection.object.heading_rad?;
+    let bias = &sensors.get(scan.sensor)?.pose_bias;
+    Some(bias.correct_heading(heading_rad))
 }

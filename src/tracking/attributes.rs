@@ -1,0 +1,123 @@
+//! Label, heading and size of an object: what each vehicle states, and the majority of the vehicles.
+//!
+//! Each vehicle counts once, however often it reports, so that one vehicle cannot decide against two
+//! others.
+
+use smallvec::SmallVec;
+
+use crate::model::geometry::wrap_angle;
+use crate::model::names::Label;
+use crate::wire::PerceivedObject;
+
+/// Maximum number of labels; the most likely labels are kept.
+const MAX_LABELS: usize = 8;
+
+/// Share of earlier readings that remains after a reading.
+const KEPT: f64 = 0.95;
+
+/// Share of a new value in heading and size.
+const SHARE: f64 = 0.3;
+
+/// Number of readings with which a vehicle has half of its weight.
+const HALF_WEIGHT_READINGS: f64 = 2.0;
+
+/// Labels with their weights.
+pub(super) type LabelWeights = SmallVec<[(Label, f64); 1]>;
+
+/// Attributes of one object as one vehicle states them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct StatedAttributes {
+    /// Fading sums of the scores by label.
+    labels: LabelWeights,
+    /// Fading number of readings.
+    readings: f64,
+    /// Smoothed direction, radians.
+    heading_rad: Option<f64>,
+    /// Smoothed length and width, metres.
+    size_m: Option<[f64; 2]>,
+}
+
+impl StatedAttributes {
+    /// Adds a detection; `heading_rad` is its corrected heading, `trust` the trust in the vehicle.
+    pub(super) fn record(
+        &mut self,
+        object: &PerceivedObject,
+        heading_rad: Option<f64>,
+        trust: f64,
+    ) {
+        self.readings = KEPT * self.readings + 1.0;
+        self.labels
+            .iter_mut()
+            .for_each(|(_, weight)| *weight *= KEPT);
+        if object.scores.is_empty() {
+            add(&mut self.labels, &object.label, trust * object.confidence);
+        }
+        for (label, score) in &object.scores {
+            add(&mut self.labels, label, trust * score);
+        }
+        keep_most_likely(&mut self.labels);
+        if let Some(new) = heading_rad {
+            let old = self.heading_rad.unwrap_or(new);
+            self.heading_rad = Some(wrap_angle(old + SHARE * wrap_angle(new - old)));
+        }
+        if let Some(new) = object.size_m {
+            let old = self.size_m.unwrap_or(new);
+            self.size_m = Some([0, 1].map(|side| old[side] + SHARE * (new[side] - old[side])));
+        }
+    }
+}
+
+/// Sum of the vehicles' mean scores by label. A vehicle with few readings has less weight.
+pub(super) fn labels<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> LabelWeights {
+    let mut sum = LabelWeights::new();
+    for attributes in stated {
+        for (label, weight) in &attributes.labels {
+            let readings = attributes.readings + HALF_WEIGHT_READINGS;
+            add(&mut sum, label, weight / readings);
+        }
+    }
+    keep_most_likely(&mut sum);
+    sum
+}
+
+/// The stated heading with the smallest sum of angles to the others: their median on the circle.
+pub(super) fn heading_rad<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Option<f64> {
+    let headings: SmallVec<[f64; 8]> = stated
+        .filter_map(|attributes| attributes.heading_rad)
+        .collect();
+    let distance = |heading: &f64| -> f64 {
+        let others = headings.iter();
+        others.map(|other| wrap_angle(other - heading).abs()).sum()
+    };
+    let median = headings
+        .iter()
+        .min_by(|a, b| distance(a).total_cmp(&distance(b)));
+    median.copied()
+}
+
+/// Median of the stated lengths and of the stated widths; of two, the smaller one.
+pub(super) fn size_m<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Option<[f64; 2]> {
+    let sizes: SmallVec<[[f64; 2]; 8]> =
+        stated.filter_map(|attributes| attributes.size_m).collect();
+    let middle = sizes.len().checked_sub(1)? / 2;
+    Some([0, 1].map(|side| {
+        let mut values: SmallVec<[f64; 8]> = sizes.iter().map(|size| size[side]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values[middle]
+    }))
+}
+
+/// Adds a weight to a label.
+pub(super) fn add(labels: &mut LabelWeights, label: &Label, weight: f64) {
+    match labels.iter_mut().find(|(known, _)| known == label) {
+        Some((_, sum)) => *sum += weight,
+        None => labels.push((label.clone(), weight)),
+    }
+}
+
+fn keep_most_likely(labels: &mut LabelWeights) {
+    if labels.len() > MAX_LABELS {
+        labels.sort_by(|a, b| b.1.total_cmp(&a.1));
+        labels.truncate(MAX_LABELS);
+    }
+}
