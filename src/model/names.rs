@@ -1,9 +1,13 @@
 //! Names that travel in topics and payloads.
 
+use std::borrow::{Borrow, Cow};
+use std::convert::Infallible;
 use std::fmt;
+use std::ops::Deref;
 use std::str::FromStr;
 
-use schemars::JsonSchema;
+use icu_normalizer::ComposingNormalizerBorrowed;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::{Deserialize, Serialize};
 use smol_str::SmolStr;
 
@@ -126,11 +130,154 @@ impl fmt::Debug for NodeName {
     }
 }
 
-/// A class label or decoded text, such as `car` or `ABCD123`. Cheap to clone.
-pub type Label = SmolStr;
+/// A class label or decoded text, such as `car` or `ABCD123`, in Unicode's form NFKC: `é` as one or
+/// two characters, and letters of full or half width, are equal (Unicode Standard Annex 15). Cheap
+/// to clone.
+#[derive(Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(from = "SmolStr", into = "SmolStr")]
+pub struct Label(SmolStr);
 
-/// The id of a landmark, such as `slot-0`. Cheap to clone.
-pub type LandmarkId = SmolStr;
+/// The id of a landmark, such as `slot-0`, in the same form as labels.
+pub type LandmarkId = Label;
+
+impl Label {
+    /// A label of this text.
+    pub fn new(text: impl AsRef<str>) -> Self {
+        Self::from(text.as_ref())
+    }
+
+    /// A label of a text in ASCII.
+    ///
+    /// # Panics
+    /// Panics if the text has other characters.
+    pub const fn new_static(text: &'static str) -> Self {
+        assert!(text.is_ascii(), "form NFKC is not checked");
+        Self(SmolStr::new_static(text))
+    }
+
+    /// The label as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl From<SmolStr> for Label {
+    fn from(text: SmolStr) -> Self {
+        if text.is_ascii() {
+            return Self(text);
+        }
+        let form = ComposingNormalizerBorrowed::new_nfkc();
+        Self(form.normalize(&text).into())
+    }
+}
+
+impl From<&str> for Label {
+    fn from(text: &str) -> Self {
+        SmolStr::new(text).into()
+    }
+}
+
+impl From<String> for Label {
+    fn from(text: String) -> Self {
+        SmolStr::new(text).into()
+    }
+}
+
+impl From<&String> for Label {
+    fn from(text: &String) -> Self {
+        SmolStr::new(text).into()
+    }
+}
+
+impl From<Label> for SmolStr {
+    fn from(label: Label) -> Self {
+        label.0
+    }
+}
+
+impl FromStr for Label {
+    type Err = Infallible;
+
+    fn from_str(text: &str) -> Result<Self, Infallible> {
+        Ok(text.into())
+    }
+}
+
+impl Deref for Label {
+    type Target = str;
+
+    fn deref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Borrow<str> for Label {
+    fn borrow(&self) -> &str {
+        &self.0
+    }
+}
+
+impl AsRef<str> for Label {
+    fn as_ref(&self) -> &str {
+        &self.0
+    }
+}
+
+impl PartialEq<str> for Label {
+    fn eq(&self, other: &str) -> bool {
+        self.0 == *other
+    }
+}
+
+impl PartialEq<&str> for Label {
+    fn eq(&self, other: &&str) -> bool {
+        self.0 == **other
+    }
+}
+
+impl PartialEq<Label> for &str {
+    fn eq(&self, other: &Label) -> bool {
+        **self == *other.0
+    }
+}
+
+impl PartialEq<Label> for str {
+    fn eq(&self, other: &Label) -> bool {
+        *self == *other.0
+    }
+}
+
+impl PartialEq<String> for Label {
+    fn eq(&self, other: &String) -> bool {
+        *self.0 == **other
+    }
+}
+
+impl fmt::Display for Label {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, f)
+    }
+}
+
+impl fmt::Debug for Label {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(&self.0, f)
+    }
+}
+
+impl JsonSchema for Label {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        SmolStr::schema_name()
+    }
+
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        SmolStr::json_schema(generator)
+    }
+}
 
 /// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without
 /// control characters.
@@ -182,6 +329,16 @@ mod tests {
         for bad in ["", "a/b", "a+", "#", "a b", "é", &"x".repeat(65)] {
             assert!(NodeName::new(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn label_forms_are_equal() {
+        let cafe = Label::from("caf\u{e9}");
+        assert_eq!(Label::from("cafe\u{301}"), cafe);
+        assert_eq!(Label::from("\u{ff43}\u{ff41}\u{ff46}\u{e9}"), cafe);
+        let read: Label = serde_json::from_str(r#""cafe\u0301""#).unwrap();
+        assert_eq!(read, cafe);
+        assert_eq!(serde_json::to_string(&read).unwrap(), "\"caf\u{e9}\"");
     }
 
     #[test]

@@ -11,14 +11,13 @@ use std::collections::BTreeMap;
 use minicbor::data::Type;
 use minicbor::decode::{self, Decode, Decoder};
 use minicbor::encode::{self, Encode, Encoder, Write};
-use smol_str::SmolStr;
 use uuid::Uuid;
 
 pub(crate) use number::{CovarianceForm, Half, Millimetres, Single};
 
 use super::RejectReason;
 use super::numbers::compact_with_integers;
-use crate::model::names::NodeName;
+use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 
 /// True if the first byte of a payload starts a compact payload: an array. JSON and CBOR with names
@@ -83,17 +82,17 @@ pub(crate) trait Form<T> {
 /// A label or an id as a text string.
 pub(crate) struct Text;
 
-impl Form<SmolStr> for Text {
+impl Form<Label> for Text {
     fn encode<C, W: Write>(
-        value: &SmolStr,
+        value: &Label,
         e: &mut Encoder<W>,
         _: &mut C,
     ) -> Result<(), encode::Error<W::Error>> {
         e.str(value)?.ok()
     }
 
-    fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<SmolStr, decode::Error> {
-        d.str().map(SmolStr::new)
+    fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<Label, decode::Error> {
+        d.str().map(Label::from)
     }
 }
 
@@ -195,9 +194,9 @@ impl<T, F: Form<T>> Form<Vec<T>> for F {
     }
 }
 
-impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
+impl<F: Form<f64>> Form<BTreeMap<Label, f64>> for F {
     fn encode<C, W: Write>(
-        values: &BTreeMap<SmolStr, f64>,
+        values: &BTreeMap<Label, f64>,
         e: &mut Encoder<W>,
         context: &mut C,
     ) -> Result<(), encode::Error<W::Error>> {
@@ -211,7 +210,7 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
     fn decode<C>(
         d: &mut Decoder<'_>,
         context: &mut C,
-    ) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
+    ) -> Result<BTreeMap<Label, f64>, decode::Error> {
         let count = d.map()?;
         let mut values = BTreeMap::new();
         let mut read = 0;
@@ -222,11 +221,11 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
         Ok(values)
     }
 
-    fn nil() -> Option<BTreeMap<SmolStr, f64>> {
+    fn nil() -> Option<BTreeMap<Label, f64>> {
         Some(BTreeMap::new())
     }
 
-    fn is_nil(values: &BTreeMap<SmolStr, f64>) -> bool {
+    fn is_nil(values: &BTreeMap<Label, f64>) -> bool {
         values.is_empty()
     }
 }

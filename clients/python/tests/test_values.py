@@ -33,6 +33,8 @@ NAMELESS = SimpleNamespace(confidence=[0.9], class_id=[7], data={})
 INVALID: list[tuple[str, Callable[[], Any]]] = [
     ("label", lambda: sent(label="\ud800")),
     ("label", lambda: sent(label=b"car")),
+    ("label", lambda: sent(label="car\u202e")),
+    ("label", lambda: sent(label="\ufdfa" * 4)),
     ("x_m", lambda: sent(x_m=10**400)),
     ("x_m", lambda: sent(x_m=np.array(1.0))),
     ("x_m", lambda: sent(x_m=Decimal(1))),
@@ -85,3 +87,10 @@ def test_numbers_of_every_library_are_taken() -> None:
     assert convert(positions=np.array([[1, 2]]), confidences=np.array([0.9])) == convert()
     assert convert(covariances=np.eye(2)[None]) == convert(covariances=[(1, 0, 1)])
     assert EQUATOR.to_map(np.float64(0.001), 0) == EQUATOR.to_map(0.001, 0)
+
+
+def test_unicode_forms_of_a_label_are_one() -> None:
+    cafe = sent(label="caf\u00e9")
+    assert sent(label="cafe\u0301") == cafe
+    assert sent(label="\uff43\uff41\uff46\u00e9") == cafe
+    assert sent(label="x", scores={"cafe\u0301": 0.5}) == sent(label="x", scores={"caf\u00e9": 0.5})

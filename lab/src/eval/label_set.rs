@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::Duration;
 
-use ecod::model::names::NodeName;
+use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::vote::{MAX_LABELS, Vote, VoteConfig, WeightedConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
@@ -115,9 +115,9 @@ pub struct VerdictScores {
     pub reliability: Reliability,
 }
 
-fn position(names: &mut HashMap<String, usize>, name: &str) -> usize {
+fn position(names: &mut HashMap<Label, usize>, name: &str) -> usize {
     let next = names.len();
-    *names.entry(name.to_owned()).or_insert(next)
+    *names.entry(name.into()).or_insert(next)
 }
 
 impl LabelSet {
@@ -268,9 +268,9 @@ fn take(verdicts: impl IntoIterator<Item = Verdict>, decisions: &mut [ItemVerdic
 /// A label set while it is read: names have numbers in the order of the file.
 #[derive(Default)]
 struct LabelSetReader {
-    items: HashMap<String, usize>,
-    voters: HashMap<String, usize>,
-    labels: HashMap<String, usize>,
+    items: HashMap<Label, usize>,
+    voters: HashMap<Label, usize>,
+    labels: HashMap<Label, usize>,
     /// By item, in the order of the file.
     answers: Vec<Vec<VoterAnswer>>,
     truths: HashMap<usize, usize>,
@@ -335,7 +335,7 @@ impl LabelSetReader {
         while let Some((line, row)) = table.next_row()? {
             let name = row.get(item_column).unwrap_or_default();
             let truth = row.get(truth_column).unwrap_or_default();
-            if let Some(&item) = self.items.get(name)
+            if let Some(&item) = self.items.get(&Label::from(name))
                 && !truth.is_empty()
             {
                 self.add_truth(line, item, name, truth)?;
@@ -366,12 +366,12 @@ impl LabelSetReader {
         if self.labels.len() > MAX_LABELS {
             return Err(LabelSetError::TooManyLabels(self.labels.len()));
         }
-        let sorted: BTreeSet<&String> = self.labels.keys().collect();
+        let sorted: BTreeSet<&Label> = self.labels.keys().collect();
         let mut number = vec![0; self.labels.len()];
         for (place, name) in sorted.iter().enumerate() {
             number[self.labels[*name]] = place;
         }
-        let labels = sorted.into_iter().cloned().collect();
+        let labels = sorted.into_iter().map(ToString::to_string).collect();
         let mut stated = self.answers;
         let mut replaced = 0;
         let item = |(name, index): (&str, usize)| {
@@ -401,7 +401,7 @@ impl LabelSetReader {
 }
 
 /// Names with their numbers, in the order of the numbers.
-fn in_order(names: &HashMap<String, usize>) -> impl Iterator<Item = (&str, usize)> {
+fn in_order(names: &HashMap<Label, usize>) -> impl Iterator<Item = (&str, usize)> {
     let mut sorted: Vec<(&str, usize)> = names
         .iter()
         .map(|(name, number)| (name.as_str(), *number))
@@ -489,6 +489,15 @@ mod tests {
         assert_eq!(LabelSet::parse(&semicolons, None).unwrap(), plain);
         let quoted = PLAIN.replace("cup", "\"cup\"").replace("voter", "Worker");
         assert_eq!(LabelSet::parse(&quoted, None).unwrap(), plain);
+        let accented = PLAIN.replace("cup", "caf\u{e9}");
+        let decomposed = PLAIN
+            .replacen("cup", "cafe\u{301}", 1)
+            .replace("cup", "caf\u{e9}");
+        assert_eq!(
+            LabelSet::parse(&decomposed, None).unwrap(),
+            LabelSet::parse(&accented, None).unwrap(),
+            "forms of Unicode"
+        );
         let answers = "item,voter,label\nx,a,cup\nx,b,mouse\ny,a,cup\n";
         let truths = "item,truth\nx,cup\ny,mouse\nz,cup\n";
         assert_eq!(LabelSet::parse(answers, Some(truths)).unwrap(), plain);

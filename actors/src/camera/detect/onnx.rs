@@ -60,7 +60,7 @@ pub struct OnnxConfig {
     pub threshold: f64,
     /// Minimum confidence by label, in place of `threshold`.
     #[serde(default)]
-    pub thresholds: BTreeMap<String, f64>,
+    pub thresholds: BTreeMap<Label, f64>,
     /// Intersection over union above which two boxes of one class are merged. Default 0.5. Not for
     /// models that suppress such boxes themselves.
     #[serde(default = "default_max_overlap")]
@@ -308,7 +308,7 @@ pub enum OnnxError {
         /// Path of the model file.
         path: PathBuf,
         /// Label that `thresholds` names.
-        label: String,
+        label: Label,
         /// All labels of the model, as text.
         labels: String,
     },
@@ -599,7 +599,7 @@ fn classes(
     config: &OnnxConfig,
     labels: Vec<Option<Label>>,
 ) -> Result<Vec<Option<Class>>, OnnxError> {
-    let is_known = |label: &str| labels.iter().flatten().any(|known| known == label);
+    let is_known = |label: &Label| labels.iter().flatten().any(|known| known == label);
     if let Some(label) = config.thresholds.keys().find(|label| !is_known(label)) {
         let labels = labels
             .iter()
@@ -616,7 +616,7 @@ fn classes(
     let threshold = |label: &Label| {
         config
             .thresholds
-            .get(label.as_str())
+            .get(label)
             .copied()
             .unwrap_or(config.threshold) as f32
     };

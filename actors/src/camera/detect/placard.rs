@@ -5,7 +5,7 @@
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::{BoundingBox, Detection};
-use ecod::model::names::{Label, MAX_NAME_BYTES};
+use ecod::model::names::{Label, is_label};
 use nalgebra::Point2;
 use opencv::core::{CV_8UC1, CV_8UC3, Mat, Point, Rect, Scalar, Size, ToInputArray, Vector};
 use opencv::imgproc;
@@ -322,9 +322,8 @@ impl Code {
 }
 
 fn label(text: Vec<u8>) -> Option<Label> {
-    let text = String::from_utf8(text).ok()?;
-    let usable = (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(char::is_control);
-    usable.then(|| Label::from(text))
+    let label = Label::from(String::from_utf8(text).ok()?);
+    is_label(&label).then_some(label)
 }
 
 fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {

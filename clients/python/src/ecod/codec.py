@@ -119,6 +119,7 @@ def _ruled(inner: Reader, rule: Rule, in_millimetres: bool) -> Reader:
         value = inner(value, is_compact)
         if in_millimetres and is_compact:
             value /= 1000
+        value = rule.form(value)
         return value if rule.holds(value) else _fail(value, rule.text)
 
     return read

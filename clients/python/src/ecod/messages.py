@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import unicodedata
 import uuid
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
@@ -25,10 +26,11 @@ SCHEMA_VERSION = 1
 
 
 class Rule(NamedTuple):
-    """A condition on a field's value, and its wording."""
+    """A condition on a field's value, its wording, and the form in which the value is kept."""
 
     holds: Callable[[Any], bool]
     text: str
+    form: Callable[[Any], Any] = lambda value: value
 
 
 # Marks a field that the compact encoding gives in whole millimetres.
@@ -43,10 +45,13 @@ def _at_most(number: int) -> Rule:
     return Rule(lambda items: len(items) <= number, f"must have at most {number} entries")
 
 
+# Characters that control a device, break lines or change the direction of other text.
+CONTROLS = re.compile("[\0-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
 def _is_label(text: str) -> bool:
-    has_controls = any(ord(character) < 32 or 127 <= ord(character) < 160 for character in text)
     try:
-        return 1 <= len(text.encode()) <= 64 and not has_controls
+        return 1 <= len(text.encode()) <= 64 and not CONTROLS.search(text)
     except UnicodeEncodeError:  # half of a character, which no encoding has
         return False
 
@@ -71,7 +76,15 @@ def is_name(text: str) -> bool:
 Schema = Annotated[int, Rule(lambda value: value == SCHEMA_VERSION, "is unknown: this package reads version 1")]
 Count = Annotated[int, Rule(lambda value: 0 <= value < 2**53, "must be from 0 to 2⁵³ − 1")]
 Name = Annotated[str, Rule(is_name, "must be 1 to 64 of A-Z a-z 0-9 _ -")]
-Label = Annotated[str, Rule(_is_label, "must have 1 to 64 bytes in UTF-8 and no control characters")]
+Label = Annotated[
+    str,
+    Rule(
+        _is_label,
+        "must have 1 to 64 bytes in UTF-8 and no control characters",
+        # As nodes compare labels.
+        lambda text: unicodedata.normalize("NFKC", text),
+    ),
+]
 Uuid = Annotated[str, Rule(_is_uuid, "must be a UUID")]
 Hash = Annotated[str, Rule(lambda text: re.fullmatch("[0-9a-f]{64}", text) is not None, "must be 64 hexadecimal digits")]
 Fraction = Annotated[float, _between(0, 1)]

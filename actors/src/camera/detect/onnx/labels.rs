@@ -157,5 +157,5 @@ pub(super) fn first_unusable(names: &[String]) -> Option<&str> {
     names
         .iter()
         .map(String::as_str)
-        .find(|name| !is_label(name))
+        .find(|name| !is_label(&Label::from(*name)))
 }

@@ -61,7 +61,7 @@ impl Expected {
     fn is(&self, found: &Detection) -> bool {
         let b = &found.bounding_box;
         let edges = [b.x_min, b.y_min, b.x_max, b.y_max];
-        self.label == found.label
+        found.label == self.label
             && (self.score - found.confidence).abs() < 1e-3
             && edges
                 .iter()
@@ -150,7 +150,7 @@ fn threshold_applies_to_one_label() {
         .unwrap()
         .detect(&frame())
         .unwrap();
-    let thresholds = BTreeMap::from([("person".to_owned(), 1.0)]);
+    let thresholds = BTreeMap::from([("person".into(), 1.0)]);
     let others = OnnxDetector::new(OnnxConfig {
         thresholds,
         ..labelled("yolov5")
@@ -257,7 +257,7 @@ fn label_count_must_match_classes() {
         none.contains("3 classes without names: set `labels`"),
         "{none}"
     );
-    let thresholds = BTreeMap::from([("persn".to_owned(), 0.5)]);
+    let thresholds = BTreeMap::from([("persn".into(), 0.5)]);
     let unknown = refusal(OnnxConfig {
         thresholds,
         ..config("yolov8")

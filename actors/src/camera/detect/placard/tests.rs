@@ -341,3 +341,11 @@ fn unusable_configurations_are_refused() {
         assert_eq!(config.validate().unwrap_err().key, key);
     }
 }
+
+#[test]
+fn texts_that_are_no_labels_are_dropped() {
+    assert_eq!(label("cafe\u{301}".into()), Some("caf\u{e9}".into()));
+    for text in ["", "car\n", "car\u{202e}", &"x".repeat(65)] {
+        assert_eq!(label(text.into()), None, "{}", text.escape_unicode());
+    }
+}
