@@ -3,6 +3,8 @@
 
 use std::fmt::Display;
 
+use crate::logins::without_logins;
+
 /// A configuration value that cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("configuration key `{key}`{fault}, must be {allowed}")]
@@ -33,9 +35,10 @@ pub enum ValueFault {
 }
 
 impl ConfigError {
-    /// An error about one key with the value found.
+    /// An error about one key with the value found, which is shown without a login.
     pub fn new(key: impl Into<String>, value: impl Display, allowed: impl Into<String>) -> Self {
-        Self::with_fault(key, ValueFault::NotAllowed(value.to_string()), allowed)
+        let shown = without_logins(&value.to_string());
+        Self::with_fault(key, ValueFault::NotAllowed(shown), allowed)
     }
 
     /// An error about one key without a value.

@@ -16,6 +16,7 @@ pub mod config;
 pub mod description;
 pub mod diagnostics;
 pub mod leadership;
+pub mod logins;
 pub mod model;
 pub mod neighbours;
 pub mod pace;

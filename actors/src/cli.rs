@@ -29,6 +29,7 @@ use std::process::ExitCode;
 use anyhow::{Context, anyhow};
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, Parser, Subcommand};
+use ecod::logins::without_logins;
 
 pub use logging::{LogArguments, start as start_log};
 pub use replay::cell;
@@ -224,15 +225,31 @@ pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     }
 }
 
+/// The process's arguments; ends the process if they cannot be used.
+pub fn arguments<T: Parser>() -> T {
+    T::try_parse().unwrap_or_else(|error| refuse(&error))
+}
+
+/// Ends the process because of its arguments, and shows the error without logins.
+fn refuse(error: &clap::Error) -> ! {
+    let text = error.render().to_string();
+    let shown = without_logins(&text);
+    if shown == text {
+        error.exit();
+    }
+    eprint!("{shown}");
+    std::process::exit(error.exit_code())
+}
+
 /// The process's arguments; ends the process if they are invalid for every program of the project.
 fn parse() -> Result<Cli, Failure> {
     Cli::try_parse().map_err(|error| {
         let command = match error.get(ContextKind::InvalidSubcommand) {
             Some(ContextValue::String(command)) => command.as_str(),
-            _ => error.exit(),
+            _ => refuse(&error),
         };
         let other = ELSEWHERE.into_iter().find(|(name, _)| *name == command);
-        other.map_or_else(|| error.exit(), |(_, instead)| elsewhere(instead))
+        other.map_or_else(|| refuse(&error), |(_, instead)| elsewhere(instead))
     })
 }
 
@@ -303,7 +320,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:#}", self.error)
+        f.write_str(&without_logins(&format!("{:#}", self.error)))
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
+use ecod::logins::without_logins;
 use ecod_client::{Settings, Tls};
 use ecod_interop::bridge::CpmBridge;
 #[cfg(feature = "ros2")]
@@ -237,7 +238,7 @@ fn class_label(text: &str) -> Result<(String, String), String> {
 #[derive(Args)]
 struct Connection {
     /// HOST:PORT of the node's local broker.
-    #[arg(long, env = "ECOD_BROKER")]
+    #[arg(long, env = "ECOD_BROKER", hide_env_values = true)]
     broker: Option<String>,
     /// Name of the cell.
     #[arg(long, env = "ECOD_CELL")]
@@ -270,12 +271,25 @@ impl Connection {
     }
 }
 
+/// The process's arguments; ends the process if they cannot be used. The error shows no login.
+fn arguments() -> Cli {
+    Cli::try_parse().unwrap_or_else(|error| {
+        let text = error.render().to_string();
+        let shown = without_logins(&text);
+        if shown == text {
+            error.exit();
+        }
+        eprint!("{shown}");
+        std::process::exit(error.exit_code())
+    })
+}
+
 fn main() -> ExitCode {
     env_logger::Builder::from_env(
         env_logger::Env::default().default_filter_or("info,rustdds=error"),
     )
     .init();
-    let ended = match Cli::parse().command {
+    let ended = match arguments().command {
         Command::Cpm(connection) => CpmBridge::connect(connection.settings())
             .and_then(|bridge| bridge.run())
             .map_err(|error| error.to_string()),

@@ -17,7 +17,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use ecod_actors::cli::{LogArguments, exit, start_log};
+use ecod_actors::cli::{LogArguments, arguments, exit, start_log};
 use serde::Serialize;
 
 /// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which must be in the
@@ -57,7 +57,7 @@ enum Command {
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = arguments::<Cli>();
     start_log(cli.log.log_format, false, "warn");
     let outcome = match cli.command {
         Command::Demo(arguments) => demo::run(&arguments),

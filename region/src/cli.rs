@@ -8,7 +8,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use ecod_actors::cli::{Failure, LogArguments, exit, start_log};
+use ecod_actors::cli::{Failure, LogArguments, arguments, exit, start_log};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -34,7 +34,7 @@ enum Command {
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = arguments::<Cli>();
     let is_service = matches!(cli.command, Command::Serve(_));
     let _export = start_log(
         cli.log.log_format,

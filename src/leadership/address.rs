@@ -8,6 +8,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smol_str::{SmolStr, ToSmolStr, format_smolstr};
 
+use crate::logins::without_login;
+
 /// Host and port of a broker, such as `192.168.1.10:1883`, `[fe80::1]:1883` or `broker.local:1883`.
 #[derive(
     Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema,
@@ -18,7 +20,7 @@ pub struct BrokerAddress {
     port: u16,
 }
 
-/// Error for a broker address that is not of the form `host:port`.
+/// Error for a broker address that is not of the form `host:port`. It contains no login.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("broker address {0:?} must be host:port, such as 192.168.1.10:1883")]
 pub struct InvalidAddress(String);
@@ -39,11 +41,13 @@ impl FromStr for BrokerAddress {
     type Err = InvalidAddress;
 
     fn from_str(text: &str) -> Result<Self, InvalidAddress> {
-        let invalid = || InvalidAddress(text.to_owned());
+        let invalid = || InvalidAddress(without_login(text));
         let (host, port) = text.rsplit_once(':').ok_or_else(invalid)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
         let allowed = |c: char| {
-            !c.is_whitespace() && c != '/' && (bracketed || !matches!(c, ':' | '[' | ']'))
+            !c.is_whitespace()
+                && !matches!(c, '/' | '@')
+                && (bracketed || !matches!(c, ':' | '[' | ']'))
         };
         let port = port.parse().map_err(|_| invalid())?;
         if host.is_empty() || port == 0 || !host.chars().all(allowed) {
@@ -107,8 +111,18 @@ mod tests {
             "::1:1883",
             "mqtt://host:1883",
             "a b:1",
+            "user@host:1883",
         ] {
             assert!(bad.parse::<BrokerAddress>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn errors_hide_logins() {
+        for address in ["user:geh eim1@host:1883", "mqtt://user:geh/eim1@host:1883"] {
+            let error = address.parse::<BrokerAddress>().unwrap_err().to_string();
+            let hidden = "broker address \"***@host:1883\" must be host:port";
+            assert!(error.starts_with(hidden), "{error}");
         }
     }
 }

@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use ecod::config::{ConfigError, check_range};
+use ecod::logins::{HIDDEN, bare_address};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +17,6 @@ use self::images::ImageSequence;
 use self::v4l2::V4l2Camera;
 use self::video::VideoProcess;
 use crate::camera::frame::CameraFrame;
-use crate::platform::secret::{HIDDEN, bare_address};
 
 /// Source of successive frames.
 pub trait FrameSource: Send {

@@ -23,7 +23,7 @@ use super::{Failure, print, run};
 use crate::node::config::NodeConfig;
 use crate::platform::bounded_file;
 use crate::platform::clock;
-use crate::transport::gossip::DEFAULT_PORT;
+use crate::transport::gossip::{DEFAULT_PORT, is_host_and_port};
 use crate::transport::invitation::{CityFiles, Host, Token, Visit, Welcome, redeem};
 use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, check_name};
 use files::NodeDirectory;
@@ -68,10 +68,18 @@ pub(super) struct InviteArguments {
     listen: Option<SocketAddr>,
     /// Node through which they find the cell where multicast does not work; may be given several
     /// times. Default: this machine
-    #[arg(long = "seed", value_name = "HOST:PORT")]
+    #[arg(long = "seed", value_name = "HOST:PORT", value_parser = seed)]
     seeds: Vec<String>,
     #[command(flatten)]
     directory: DirectoryArguments,
+}
+
+fn seed(text: &str) -> Result<String, &'static str> {
+    if is_host_and_port(text) {
+        Ok(text.to_owned())
+    } else {
+        Err("must be host:port, such as 192.168.1.10:17884")
+    }
 }
 
 /// Flags of `join`.

@@ -1,7 +1,8 @@
-//! Secrets in the configuration, and in texts that are shown.
+//! Secrets in the configuration.
 
 use std::fmt;
 
+use ecod::logins::HIDDEN;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -9,9 +10,6 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(try_from = "String")]
 pub struct Secret(String);
-
-/// Placeholder printed instead of a secret.
-pub(crate) const HIDDEN: &str = "***";
 
 /// A placeholder that was given as the secret itself.
 #[derive(Debug, thiserror::Error)]
@@ -51,123 +49,5 @@ impl Serialize for Secret {
 impl fmt::Debug for Secret {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(HIDDEN)
-    }
-}
-
-/// A text without logins and queries of addresses in it. An address whose login has no certain end,
-/// for example because of a `/` in the password, is hidden as a whole.
-pub fn without_logins(text: &str) -> String {
-    text.split('\n')
-        .map(line_without_logins)
-        .collect::<Vec<_>>()
-        .join("\n")
-}
-
-fn line_without_logins(line: &str) -> String {
-    let mut shown = String::new();
-    let mut rest = line;
-    while let Some((before, address)) = rest.split_once(SCHEME_END) {
-        shown.push_str(before);
-        shown.push_str(SCHEME_END);
-        let is_of_scheme = |c: char| c.is_ascii_alphanumeric() || matches!(c, '+' | '-' | '.');
-        let begin = before.trim_end_matches(is_of_scheme).chars().next_back();
-        let quote = begin.filter(|c| matches!(c, '"' | '\'' | '`'));
-        let token = match quote {
-            Some(quote) => address.split(quote).next(),
-            None => address
-                .split(char::is_whitespace)
-                .next()
-                // Punctuation of the sentence around the address.
-                .map(|token| token.trim_end_matches([':', ';', ',', '.', ')', '"', '\''])),
-        };
-        let (address, after) = address.split_at(token.map_or(address.len(), str::len));
-        // A login may go on behind a blank or a quote.
-        let before_next = after.split(SCHEME_END).next().unwrap_or(after);
-        let is_half = if quote.is_none() {
-            before_next.contains('@') || (!address.contains('@') && may_be_half_a_login(address))
-        } else {
-            (!address.contains('@') || before_next.contains('@')) && may_be_half_a_login(address)
-        };
-        if is_half {
-            shown.push_str(HIDDEN);
-            rest = "";
-        } else {
-            shown.push_str(bare_address(address).unwrap_or(HIDDEN));
-            rest = after;
-        }
-    }
-    shown + rest
-}
-
-const SCHEME_END: &str = "://";
-
-/// An address, after its scheme, without login and query; `None` if it is not certain where the
-/// login ends.
-pub(crate) fn bare_address(address: &str) -> Option<&str> {
-    let is_end = |c: char| matches!(c, '/' | '?' | '#' | '"' | '\'' | '\\') || c.is_whitespace();
-    let authority = address.split(is_end).next().unwrap_or(address);
-    let login = authority.rfind('@').map_or(0, |at| at + 1);
-    let (_, bare) = address.split_at(login);
-    if bare.contains('@') || may_be_half_a_login(bare) {
-        return None;
-    }
-    bare.split('?').next()
-}
-
-/// True if an address without `@` begins with `name:`, but not with a port behind it.
-fn may_be_half_a_login(address: &str) -> bool {
-    let is_end = |c: char| matches!(c, '/' | '?' | '#') || c.is_whitespace();
-    let authority = address.split(is_end).next().unwrap_or(address);
-    if authority.contains('@') || authority.starts_with('[') {
-        return false;
-    }
-    let port = authority.split_once(':').map(|(_, port)| port);
-    port.is_some_and(|port| !port.bytes().all(|byte| byte.is_ascii_digit()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn address_logins_are_hidden() {
-        for (text, shown) in [
-            ("rtsp://user:p@ss@camera:554/1", "rtsp://camera:554/1"),
-            (
-                "cannot open rtsp://127.0.0.1:1: refused",
-                "cannot open rtsp://127.0.0.1:1: refused",
-            ),
-            (
-                "at http://camera/video?user=admin&pwd=hush.",
-                "at http://camera/video.",
-            ),
-            (
-                "to http://[fe80::1]:80/x, 2 tries",
-                "to http://[fe80::1]:80/x, 2 tries",
-            ),
-            ("rtsp://admin:Geh/eim1@camera/1 failed", "rtsp://*** failed"),
-            ("rtsp://admin:Geh?eim1@camera/1", "rtsp://***"),
-            ("rtsp://admin:G@h/eim1@camera/1", "rtsp://***"),
-            ("http://camera/a@b", "http://***"),
-            ("rtsp://admin:ge heim1@camera/1 failed", "rtsp://***"),
-            (
-                "location=\"rtsp://admin:ge heim1@camera\" ! x",
-                "location=\"rtsp://***\" ! x",
-            ),
-            ("'rtsp://admin:ge'heim1@camera'", "'rtsp://***"),
-            ("rtsp://admin:ge\"heim1@camera/1", "rtsp://***"),
-            ("rtsp://admin:p@ss wort@camera/1", "rtsp://***"),
-            ("rtsp://admin:12 34@camera/1", "rtsp://***"),
-            (
-                "rtsp://u:p@one ! mix rtsp://u:p@two ! appsink",
-                "rtsp://one ! mix rtsp://two ! appsink",
-            ),
-            (
-                "first\nmqtt://u:geheim1@broker:1883\nlast",
-                "first\nmqtt://broker:1883\nlast",
-            ),
-        ] {
-            assert_eq!(without_logins(text), shown);
-        }
     }
 }

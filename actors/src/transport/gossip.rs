@@ -32,6 +32,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
+pub(crate) use config::is_host_and_port;
 pub use config::{DEFAULT_PORT, MembershipConfig, MulticastConfig};
 pub use counters::{FrameCounters, FrameEvent};
 pub(crate) use key::payload_key;

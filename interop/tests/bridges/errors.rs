@@ -11,6 +11,8 @@ const COMMANDS: &[&str] = &[
     "cmp",
     "cpm --cell lot/1",
     "cpm --node two/parts",
+    "cpm --broker user:geheim1@broker:1883",
+    "cpm --brokr=user:geheim1@broker:1883",
     "cpm --ca ca.pem",
     "cpm --ca ca.pem --certificate edge.pem --key edge-key.pem",
     "ros2 missing.mcap output.mcap",

@@ -16,6 +16,7 @@ const COMMANDS: &[&str] = &[
     "testbed --scenes empty.json --at-least many",
     "bench --cavs four",
     "bench --connect nowhere",
+    "bench --connect mqtt://user:geheim1@broker:1883",
     "bench --connect 127.0.0.1:1 --config node.toml",
     "report missing.mcap",
     "report log.mcap",

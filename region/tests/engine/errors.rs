@@ -11,6 +11,7 @@ const COMMANDS: &[&str] = &[
     "servee",
     "serve",
     "serve --broker nowhere",
+    "serve --broker user:geheim1@broker:1883",
     "serve --broker 127.0.0.1:1883 --user edge",
     "serve --broker 127.0.0.1:1883 --user edge --password-file missing",
     "serve --broker 127.0.0.1:1883 --user edge --password-file empty",

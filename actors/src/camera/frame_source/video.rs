@@ -22,6 +22,7 @@ use std::sync::{Arc, LazyLock, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ecod::logins::without_logins;
 use opencv::core::{Mat, Scalar};
 use opencv::prelude::*;
 use regex_lite::Regex;
@@ -30,7 +31,6 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
 use super::{FrameError, FrameSource, SourceConfig};
 use crate::camera::frame::CameraFrame;
-use crate::platform::secret::without_logins;
 use crate::platform::{clock, installed};
 
 /// Name of the program.

@@ -2,13 +2,13 @@
 
 use std::sync::LazyLock;
 
+use ecod::logins::without_logins;
 use figment::Figment;
 use figment::error::Kind;
 use figment::providers::{Env, Serialized};
 use figment::value::{Dict, Value};
 
 use super::{LoadError, NodeConfig};
-use crate::platform::secret::without_logins;
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
 

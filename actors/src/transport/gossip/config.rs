@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ecod::config::{ConfigError, ValueFault, check_range};
+use ecod::logins::without_login;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -141,7 +142,7 @@ impl MembershipConfig {
         if let Some(seed) = self.seeds.iter().find(|seed| !is_host_and_port(seed)) {
             return Err(ConfigError::new(
                 "seeds",
-                seed,
+                without_login(seed),
                 "host:port, such as 192.168.1.10:17884",
             ));
         }
@@ -197,10 +198,12 @@ impl MulticastConfig {
 /// Minimum length of a cell's key in bytes.
 pub(crate) const MIN_KEY_BYTES: usize = 12;
 
-fn is_host_and_port(text: &str) -> bool {
+/// True if `text` can be a seed.
+pub(crate) fn is_host_and_port(text: &str) -> bool {
     text.rsplit_once(':').is_some_and(|(host, port)| {
         let port = port.parse::<u16>().is_ok_and(|port| port != 0);
-        port && !host.is_empty() && !host.contains(|c: char| c.is_whitespace() || c == '/')
+        port && !host.is_empty()
+            && !host.contains(|c: char| c.is_whitespace() || matches!(c, '/' | '@'))
     })
 }
 
@@ -219,6 +222,7 @@ mod tests {
             ),
             ("advertise = \"0.0.0.0:1\"", "advertise"),
             ("seeds = [\"host\"]", "seeds"),
+            ("seeds = [\"user@host:1\"]", "seeds"),
             ("reply_ms = 50", "reply_ms"),
             ("[multicast]\ngroup = \"10.0.0.1\"", "multicast.group"),
         ] {

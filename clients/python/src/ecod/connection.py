@@ -251,10 +251,14 @@ def host_and_port(address: str, default_port: int) -> tuple[str, int]:
     """The parts of HOST:PORT; the port may be absent."""
     try:
         parts = urlsplit(f"//{address}")
-        if parts.hostname and not parts.path and parts.port != 0:
+        if parts.hostname and "@" not in parts.netloc and not parts.path and parts.port != 0:
             return parts.hostname, parts.port or default_port
     except ValueError:
         pass
+    # The error shows no login; its cause would.
+    login, at, host = address.rpartition("@")
+    if at:
+        raise Invalid(f"broker {'***@' + host!r} must be HOST:PORT; a login is `user` and `password`") from None
     raise Invalid(f"broker {address!r} must be HOST:PORT")
 
 
