@@ -82,19 +82,36 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     Ok(bgr)
 }
 
+/// Segment by which decoders recognise motion JPEG: without Huffman tables of its own, the image
+/// uses the tables of the JPEG standard, K.3.
+const MOTION_JPEG: &[u8] = b"\xff\xe0\0\x07AVI1\0";
+
+/// Decodes a picture of motion JPEG, perhaps without Huffman tables, as [`decode`].
+///
+/// # Errors
+/// Returns an error of [`decode`].
+pub(crate) fn decode_motion_jpeg(bytes: &[u8]) -> Result<Mat, ImageError> {
+    let (start, rest) = bytes.split_at(bytes.len().min(2));
+    decode(&[start, MOTION_JPEG, rest].concat())
+}
+
 /// True if a JPEG has the marker of its end (ITU-T T.81, B.1.1.3), outside of its segments: a
 /// thumbnail inside a segment has one, too.
 fn has_end_of_image(jpeg: &[u8]) -> bool {
     const START_OF_IMAGE: u8 = 0xD8;
     const END_OF_IMAGE: u8 = 0xD9;
-    let mut rest = jpeg;
+    let mut rest = jpeg.get(2..).unwrap_or_default();
     // In coded data, 0xFF precedes a zero or a restart marker, 0xD0 to 0xD7; a marker may have
     // several 0xFF before it.
-    while let Some(at) = rest.windows(2).position(|pair| {
-        pair[0] == 0xFF && !matches!(pair[1], 0x00 | 0x01 | 0xFF | 0xD0..=START_OF_IMAGE)
-    }) {
-        if rest[at + 1] == END_OF_IMAGE {
-            return true;
+    while let Some(at) = rest
+        .windows(2)
+        .position(|pair| pair[0] == 0xFF && !matches!(pair[1], 0x00 | 0x01 | 0xFF | 0xD0..=0xD7))
+    {
+        match rest[at + 1] {
+            END_OF_IMAGE => return true,
+            // The next picture of a stream.
+            START_OF_IMAGE => return false,
+            _ => {}
         }
         let segment = &rest[at + 2..];
         let length = segment

@@ -49,6 +49,21 @@ fn play(source: &mut dyn FrameSource) -> (Vec<u8>, FrameError) {
     }
 }
 
+/// Brightness of all frames up to the end, and the errors about frames that were skipped.
+fn play_whole_frames(source: &mut dyn FrameSource) -> (Vec<u8>, Vec<String>) {
+    let mut seen = Vec::new();
+    let mut skipped = Vec::new();
+    loop {
+        match source.next_frame() {
+            Ok(frame) => seen.push(brightness(&frame)),
+            Err(FrameError::NotDue) => {}
+            Err(error @ FrameError::Unusable { .. }) => skipped.push(error.to_string()),
+            Err(FrameError::Ended { .. } | FrameError::Lost { .. }) => return (seen, skipped),
+            Err(error) => panic!("{error}"),
+        }
+    }
+}
+
 fn near(seen: &[u8], expected: &[u8]) -> bool {
     seen.len() == expected.len() && seen.iter().zip(expected).all(|(a, b)| a.abs_diff(*b) <= 4)
 }
@@ -340,6 +355,78 @@ fn network_camera_works_until_disconnect() {
     assert!(
         origin.ends_with("/stream") && !origin.contains("hunter2"),
         "{origin}"
+    );
+}
+
+/// JPEG pictures of these brightnesses; the second is cut off and the fourth is no picture.
+fn damaged_pictures() -> Vec<Vec<u8>> {
+    let mut pictures: Vec<_> = [40, 80, 120, 160, 200]
+        .map(|value| encode_jpeg(&gray(value), 95).unwrap())
+        .into();
+    let length = pictures[1].len();
+    pictures[1].truncate(length - 20);
+    pictures[3].fill(7);
+    pictures
+}
+
+#[test]
+fn damaged_pictures_of_stream_are_skipped() {
+    let url = network_camera(|mut visitor| {
+        write!(
+            visitor,
+            "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n"
+        )?;
+        // FFmpeg reads a picture up to the next one.
+        let last = encode_jpeg(&gray(240), 95).unwrap();
+        for jpeg in damaged_pictures().into_iter().chain([last]) {
+            let length = jpeg.len();
+            write!(
+                visitor,
+                "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {length}\r\n\r\n"
+            )?;
+            visitor.write_all(&jpeg)?;
+            write!(visitor, "\r\n")?;
+        }
+        Ok(())
+    });
+    let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
+    let (seen, skipped) = play_whole_frames(source.as_mut());
+    assert!(
+        seen.len() >= 3 && near(&seen[..3], &[40, 120, 200]),
+        "{seen:?} {skipped:?}"
+    );
+    assert_eq!(skipped.len(), 2, "{skipped:?}");
+    assert!(skipped[0].contains("cut off"), "{skipped:?}");
+}
+
+#[test]
+fn damaged_pictures_of_file_are_skipped() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("clip.avi");
+    let mjpg = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
+    let mut writer = VideoWriter::new(&path, mjpg, 20.0, Size::new(64, 48), true).unwrap();
+    for value in [40, 80, 120, 160, 200] {
+        writer.write(&gray(value)).unwrap();
+    }
+    writer.release().unwrap();
+    let mut avi = fs::read(&path).unwrap();
+    let starts: Vec<usize> = (0..avi.len())
+        .filter(|at| avi[*at..].starts_with(b"\xff\xd8\xff"))
+        .collect();
+    assert_eq!(starts.len(), 5);
+    // Without the end of the second picture, and the fourth as a whole.
+    avi[starts[2] - 40..starts[2] - 8].fill(0);
+    avi[starts[3]..starts[4] - 8].fill(7);
+    fs::write(&path, avi).unwrap();
+    let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = false")).unwrap();
+    let began = Instant::now();
+    let (seen, skipped) = play_whole_frames(source.as_mut());
+    assert!(near(&seen, &[40, 120, 200]), "{seen:?} {skipped:?}");
+    assert_eq!(skipped.len(), 2, "{skipped:?}");
+    let played = began.elapsed();
+    assert!(
+        played > Duration::from_millis(190),
+        "five frames: {played:?}"
     );
 }
 

@@ -190,6 +190,11 @@ fn jpeg_without_end_is_refused() {
         assert!(matches!(error, ImageError::CutOff), "{bytes}: {error}");
     }
     assert!(cut(whole.len() / 2).is_err());
+    let next = [&pictured[..pictured.len() - 20], &whole[..]].concat();
+    assert!(
+        matches!(decode(&next), Err(ImageError::CutOff)),
+        "the end of the next picture"
+    );
     let zeros = [&whole[..whole.len() / 2], &vec![0; whole.len() / 2]].concat();
     assert!(
         decode(&zeros).is_err(),

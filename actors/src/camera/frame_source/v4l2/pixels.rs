@@ -52,10 +52,6 @@ const CONVERSIONS: [PixelConversion; 11] = {
     ]
 };
 
-/// Segment by which decoders recognise motion JPEG: without Huffman tables of its own, the image
-/// uses the tables of the JPEG standard, K.3.
-const MOTION_JPEG: &[u8] = b"\xff\xe0\0\x07AVI1\0";
-
 impl PixelConversion {
     /// All formats that can be converted, the preferred first.
     pub(super) fn formats() -> [PixelFormat; CONVERSIONS.len()] {
@@ -132,9 +128,7 @@ impl FrameLayout {
     /// The image in a buffer as BGR.
     pub(super) fn to_bgr(self, buffer: &[u8]) -> Result<Mat, String> {
         if self.way == Way::Jpeg {
-            let (start, rest) = buffer.split_at(buffer.len().min(2));
-            return image_codec::decode(&[start, MOTION_JPEG, rest].concat())
-                .map_err(|error| error.to_string());
+            return image_codec::decode_motion_jpeg(buffer).map_err(|error| error.to_string());
         }
         let rows = if matches!(self.way, Way::Planar(_)) {
             self.height / 2 * 3

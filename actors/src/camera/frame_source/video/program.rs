@@ -19,6 +19,7 @@ use rustix::process::{Signal, getpid, kill_process};
 use super::protocol::{self, ImageHeader, VideoMessage, VideoRequest};
 use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig};
+use crate::camera::image_codec::{self, ImageError};
 use crate::platform::clock;
 
 /// Maximum number of bytes in a pipe, as far as the kernel allows: with fewer bytes, both sides
@@ -113,8 +114,7 @@ const MAX_SILENCE: Duration = Duration::from_secs(1);
 
 struct Video {
     origin: String,
-    capture: VideoCapture,
-    presentation: Presentation,
+    pictures: Pictures,
     playback: Option<Playback>,
     seq: u64,
 }
@@ -123,6 +123,8 @@ struct Video {
 struct Playback {
     path: PathBuf,
     pacer: StampPacer,
+    /// The file once more where its pictures are read undecoded: they have no stamps.
+    stamps: Option<VideoCapture>,
     looping: bool,
     /// The next frame, until it is due.
     next: Option<Mat>,
@@ -226,6 +228,57 @@ impl Presentation {
     }
 }
 
+/// The pictures of an open source, and how they are shown.
+struct Pictures {
+    capture: VideoCapture,
+    presentation: Presentation,
+    /// True if `capture` returns pictures undecoded. FFmpeg takes damaged ones for whole, or for
+    /// the end.
+    are_jpeg: bool,
+}
+
+/// Codecs of motion JPEG, by their names in containers and by FFmpeg's.
+const MOTION_JPEG: [&[u8; 4]; 4] = [b"MJPG", b"mjpg", b"jpeg", b"mjpe"];
+
+impl Pictures {
+    fn of(mut capture: VideoCapture) -> opencv::Result<Self> {
+        let presentation = Presentation::of(&mut capture)?;
+        let codec = (capture.get(videoio::CAP_PROP_FOURCC)? as u32).to_le_bytes();
+        let are_jpeg = MOTION_JPEG.contains(&&codec)
+            && capture.get(videoio::CAP_PROP_BACKEND)? == f64::from(videoio::CAP_FFMPEG)
+            && capture.set(videoio::CAP_PROP_FORMAT, -1.0)?;
+        Ok(Self {
+            capture,
+            presentation,
+            are_jpeg,
+        })
+    }
+
+    /// A second capture of a file for the stamps of its pictures, which undecoded pictures lack.
+    fn stamps_of(&self, path: &Path) -> opencv::Result<Option<VideoCapture>> {
+        self.are_jpeg.then(|| open_file(path)).transpose()
+    }
+
+    /// The next picture, if there is one.
+    fn next(&mut self) -> opencv::Result<Option<Result<Mat, ImageError>>> {
+        let mut read = Mat::default();
+        if !self.capture.read(&mut read)? || read.empty() {
+            return Ok(None);
+        }
+        if self.are_jpeg {
+            match image_codec::decode_motion_jpeg(read.data_bytes()?) {
+                Ok(decoded) => read = decoded,
+                Err(damage) => return Ok(Some(Err(damage))),
+            }
+        }
+        Ok(Some(Ok(self.presentation.apply(read)?)))
+    }
+}
+
+fn open_file(path: &Path) -> opencv::Result<VideoCapture> {
+    VideoCapture::from_file(path, videoio::CAP_ANY)
+}
+
 impl Video {
     fn open(source: &SourceConfig, timeout: Duration) -> Result<Self, FrameError> {
         let origin = source.origin();
@@ -293,14 +346,17 @@ impl Video {
         readable(path, &origin)?;
         // In a relative path, FFmpeg takes `-` for a pipe and the text before `:` for a protocol.
         let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        let mut video = Self::live(origin, || VideoCapture::from_file(&path, videoio::CAP_ANY))?;
+        let mut video = Self::live(origin, || open_file(&path))?;
         let fps = video
+            .pictures
             .capture
             .get(videoio::CAP_PROP_FPS)
             .ok()
             .filter(|fps| PLAUSIBLE_FPS.contains(fps));
+        let stamps = video.pictures.stamps_of(&path).map_err(|e| video.lost(e))?;
         video.playback = Some(Playback {
             path,
+            stamps,
             pacer: StampPacer {
                 period: Duration::from_secs_f64(1.0 / fps.unwrap_or(FALLBACK_FPS)),
                 stamp_ms: 0.0,
@@ -321,17 +377,16 @@ impl Video {
             origin: origin.clone(),
             reason,
         };
-        let mut capture = open().map_err(|e| failed(e.message))?;
+        let capture = open().map_err(|e| failed(e.message))?;
         if !capture.is_opened().map_err(|e| failed(e.message))? {
             return Err(failed(
                 "opencv finds no video there: see whether a player shows it".into(),
             ));
         }
-        let presentation = Presentation::of(&mut capture).map_err(|e| failed(e.message))?;
+        let pictures = Pictures::of(capture).map_err(|e| failed(e.message))?;
         Ok(Self {
             origin,
-            capture,
-            presentation,
+            pictures,
             playback: None,
             seq: 0,
         })
@@ -339,13 +394,16 @@ impl Video {
 
     /// The next image, if there is one.
     fn read(&mut self) -> Result<Option<Mat>, FrameError> {
-        let mut decoded = Mat::default();
-        let read = self.capture.read(&mut decoded).map_err(|e| self.lost(e))?;
-        if !read || decoded.empty() {
-            return Ok(None);
+        let read = self.pictures.next();
+        if let Some(stamps) = self.playback.as_mut().and_then(|p| p.stamps.as_mut()) {
+            // False for a picture that FFmpeg cannot decode.
+            stamps.grab().map_err(|e| self.lost(e))?;
         }
-        let image = self.presentation.apply(decoded);
-        image.map(Some).map_err(|e| self.lost(e))
+        let image = read.map_err(|e| self.lost(e))?.transpose();
+        image.map_err(|damage| FrameError::Unusable {
+            origin: self.origin.clone(),
+            reason: damage.to_string(),
+        })
     }
 
     /// The next image of a file, from its beginning again if it loops.
@@ -355,12 +413,16 @@ impl Video {
             .playback
             .as_ref()
             .filter(|playback| image.is_none() && playback.looping && self.seq > 0);
-        let Some(playback) = again else {
+        let Some(Playback { path, .. }) = again else {
             return Ok(image);
         };
-        let reopened = VideoCapture::from_file(&playback.path, videoio::CAP_ANY);
-        self.capture = reopened.map_err(|e| self.lost(e))?;
-        self.presentation = Presentation::of(&mut self.capture).map_err(|e| self.lost(e))?;
+        let pictures = open_file(path).and_then(Pictures::of);
+        let pictures = pictures.map_err(|e| self.lost(e))?;
+        let stamps = pictures.stamps_of(path).map_err(|e| self.lost(e))?;
+        if let Some(playback) = &mut self.playback {
+            playback.stamps = stamps;
+        }
+        self.pictures = pictures;
         self.read()
     }
 
@@ -390,7 +452,8 @@ impl FrameSource for Video {
         })?;
         if let Some(playback) = &mut self.playback {
             if !is_waiting {
-                let stamp_ms = self.capture.get(videoio::CAP_PROP_POS_MSEC);
+                let stamps = playback.stamps.as_ref().unwrap_or(&self.pictures.capture);
+                let stamp_ms = stamps.get(videoio::CAP_PROP_POS_MSEC);
                 playback.pacer.schedule(stamp_ms.unwrap_or_default());
             }
             if !playback.pacer.wait(playback.patience) {
