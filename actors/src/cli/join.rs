@@ -3,7 +3,7 @@
 mod files;
 
 use std::io::{BufRead, Read};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -13,6 +13,7 @@ use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
+use nix::sys::socket::SockaddrStorage;
 use ring::rand::{SecureRandom, SystemRandom};
 use serde_json::json;
 use tokio::net::TcpListener;
@@ -107,9 +108,6 @@ struct DirectoryArguments {
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
 }
-
-/// Most addresses in a token.
-const MAX_ADDRESSES: usize = 4;
 
 impl InitArguments {
     /// True if the command continues as a node.
@@ -211,15 +209,13 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         );
     }
     let city = directory.city(authority.is_of_city().map_err(|error| anyhow!(error))?)?;
-    let unspecified = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let left = runtime.block_on(async {
-        let address = arguments.listen.unwrap_or(unspecified);
-        let listener = TcpListener::bind(address).await.with_context(|| format!("cannot listen on {address}"))?;
+        let listener = listen(arguments.listen).await?;
         let bound = listener.local_addr()?;
-        let addresses = if bound.ip().is_unspecified() { own_addresses(bound.port())? } else { vec![bound] };
+        let addresses = if bound.ip().is_unspecified() { own_addresses(bound)? } else { vec![bound] };
         let seeds = if arguments.seeds.is_empty() {
-            addresses.iter().map(|address| SocketAddr::new(address.ip(), DEFAULT_PORT).to_string()).collect()
+            seeds_at(&addresses)
         } else {
             arguments.seeds.clone()
         };
@@ -240,7 +236,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
                  that was another machine than {node}'s, change the cell's key, too",
                 directory.pki().join("revoked.pem").display()
             ),
-            Visit::Failed(from, reason) => eprintln!("{from} has not joined: {reason}"),
+            Visit::Failed(from, reason) => eprintln!("{} has not joined: {reason}", from.ip().to_canonical()),
         };
         anyhow::Ok(host.serve(listener, until, report_visit).await)
     })?;
@@ -355,8 +351,22 @@ fn new_cell_key() -> anyhow::Result<String> {
     Ok(hex::encode(key) + "\n")
 }
 
-/// Addresses at which other machines may reach a port of this one.
-fn own_addresses(port: u16) -> anyhow::Result<Vec<SocketAddr>> {
+/// Listens at an address, or else at a free port of all addresses of this machine.
+async fn listen(address: Option<SocketAddr>) -> anyhow::Result<TcpListener> {
+    if address.is_none()
+        && let Ok(listener) = TcpListener::bind((Ipv6Addr::UNSPECIFIED, 0)).await
+    {
+        return Ok(listener);
+    }
+    // Also where the system has no IPv6.
+    let address = address.unwrap_or((Ipv4Addr::UNSPECIFIED, 0).into());
+    TcpListener::bind(address)
+        .await
+        .with_context(|| format!("cannot listen on {address}"))
+}
+
+/// Addresses at which other machines may reach a port that is bound at all addresses.
+fn own_addresses(bound: SocketAddr) -> anyhow::Result<Vec<SocketAddr>> {
     let is_usable = |flags: InterfaceFlags| {
         flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING)
             && !flags.contains(InterfaceFlags::IFF_LOOPBACK)
@@ -364,14 +374,69 @@ fn own_addresses(port: u16) -> anyhow::Result<Vec<SocketAddr>> {
     let interfaces = getifaddrs()
         .context("cannot list this machine's addresses; give one by --listen IP:PORT")?;
     let addresses = interfaces.filter(|interface| is_usable(interface.flags));
-    let ips = addresses.filter_map(|interface| Some(interface.address?.as_sockaddr_in()?.ip()));
-    let found: Vec<_> = ips
-        .map(|ip| SocketAddr::new(IpAddr::V4(ip), port))
-        .take(MAX_ADDRESSES)
-        .collect();
+    let ips = addresses.filter_map(|interface| ip_of(&interface.address?));
+    let found = reachable(ips, bound);
     anyhow::ensure!(
         !found.is_empty(),
         "this machine has no address on a network; give one by --listen IP:PORT"
     );
     Ok(found)
+}
+
+fn ip_of(address: &SockaddrStorage) -> Option<IpAddr> {
+    let v4 = address.as_sockaddr_in().map(|v4| v4.ip().into());
+    v4.or_else(|| address.as_sockaddr_in6().map(|v6| v6.ip().into()))
+}
+
+/// The addresses of a machine that other machines can use, IPv4 first. Link-local addresses of IPv6
+/// are left out: each machine needs its own number of the interface to reach them.
+fn reachable(ips: impl Iterator<Item = IpAddr>, bound: SocketAddr) -> Vec<SocketAddr> {
+    let is_usable = |ip: &IpAddr| match ip {
+        IpAddr::V4(_) => true,
+        IpAddr::V6(v6) => bound.is_ipv6() && !v6.is_unicast_link_local(),
+    };
+    let mut found: Vec<_> = ips
+        .filter(is_usable)
+        .map(|ip| SocketAddr::new(ip, bound.port()))
+        .collect();
+    found.sort_by_key(SocketAddr::is_ipv6);
+    found
+}
+
+/// This machine's node as the seed of others. Nodes gossip over IPv4 by default, so addresses of
+/// IPv6 are seeds only without any of IPv4.
+fn seeds_at(addresses: &[SocketAddr]) -> Vec<String> {
+    let has_ipv4 = addresses.iter().any(SocketAddr::is_ipv4);
+    addresses
+        .iter()
+        .filter(|address| address.is_ipv4() == has_ipv4)
+        .map(|address| SocketAddr::new(address.ip(), DEFAULT_PORT).to_string())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tokens_have_all_usable_addresses() {
+        let ips = "fe80::1 2001:db8::1 10.0.0.1 10.0.1.1 10.0.2.1 10.0.3.1 10.0.4.1 fd00::1";
+        let ips = || ips.split(' ').map(|ip| ip.parse().unwrap());
+        let found = reachable(ips(), "[::]:7".parse().unwrap());
+        let found: Vec<String> = found.iter().map(ToString::to_string).collect();
+        assert_eq!(
+            found.join(" "),
+            "10.0.0.1:7 10.0.1.1:7 10.0.2.1:7 10.0.3.1:7 10.0.4.1:7 [2001:db8::1]:7 [fd00::1]:7"
+        );
+        let ipv4_only = reachable(ips(), "0.0.0.0:7".parse().unwrap());
+        assert_eq!(ipv4_only.len(), 5);
+        assert_eq!(seeds_at(&ipv4_only[..1]), ["10.0.0.1:17884"]);
+    }
+
+    #[test]
+    fn seeds_are_of_one_family() {
+        let addresses = ["10.0.0.1:7", "[2001:db8::1]:7"].map(|text| text.parse().unwrap());
+        assert_eq!(seeds_at(&addresses), ["10.0.0.1:17884"]);
+        assert_eq!(seeds_at(&addresses[1..]), ["[2001:db8::1]:17884"]);
+    }
 }

@@ -1,9 +1,12 @@
 //! The side that joins.
 
 use std::io;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::StreamExt;
+use futures_util::stream::FuturesUnordered;
 use rcgen::{CertificateParams, KeyPair};
 use ring::digest::{SHA256, digest};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -14,7 +17,7 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{CertificateError, ClientConfig, DigitallySignedStruct, SignatureScheme};
 use tokio::io::BufStream;
 use tokio::net::TcpStream;
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
@@ -25,6 +28,10 @@ use super::{
 
 /// Maximum time for a connection to one address of the host.
 const CONNECT_TIME: Duration = Duration::from_secs(3);
+
+/// Time between the attempts at two addresses, of which some lead nowhere from here (RFC 8305,
+/// section 5).
+const ATTEMPT_INTERVAL: Duration = Duration::from_millis(250);
 
 /// A node that was admitted. The host counts it as joined after [`Joined::keep`].
 pub struct Joined {
@@ -87,13 +94,11 @@ pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
         }
     };
     let late = |_| JoinError::Conversation(io::ErrorKind::TimedOut.into());
-    let tries = u32::try_from(token.addresses.len()).unwrap_or(u32::MAX);
-    timeout(
-        CONNECT_TIME.saturating_mul(tries) + CONVERSATION_TIME,
-        conversation,
-    )
-    .await
-    .map_err(late)?
+    let attempts = u32::try_from(token.addresses.len()).unwrap_or(u32::MAX);
+    let connect_time = CONNECT_TIME + ATTEMPT_INTERVAL.saturating_mul(attempts);
+    timeout(connect_time + CONVERSATION_TIME, conversation)
+        .await
+        .map_err(late)?
 }
 
 impl Joined {
@@ -125,19 +130,28 @@ async fn connect(token: &Token) -> Result<TlsStream<TcpStream>, JoinError> {
         .with_no_client_auth();
     let connector = TlsConnector::from(Arc::new(config));
     let name = ServerName::try_from(HOST_NAME).map_err(io::Error::other)?;
-    let mut reason = String::from("the token names no address");
-    for address in &token.addresses {
+    let connect_to = async |address: &SocketAddr, number| {
+        sleep(ATTEMPT_INTERVAL.saturating_mul(number)).await;
         let attempt = async {
-            connector
-                .connect(name.clone(), TcpStream::connect(address).await?)
-                .await
+            let stream = TcpStream::connect(address).await?;
+            connector.connect(name.clone(), stream).await
         };
-        match timeout(CONNECT_TIME, attempt)
+        let connected = timeout(CONNECT_TIME, attempt)
             .await
-            .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
-        {
+            .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
+        connected.map_err(|error| format!("{address}: {error}"))
+    };
+    let mut attempts: FuturesUnordered<_> = token
+        .addresses
+        .iter()
+        .zip(0..)
+        .map(|(address, number)| connect_to(address, number))
+        .collect();
+    let mut reason = String::from("the token names no address");
+    while let Some(connected) = attempts.next().await {
+        match connected {
             Ok(stream) => return Ok(stream),
-            Err(error) => reason = format!("{address}: {error}"),
+            Err(error) => reason = error,
         }
     }
     let addresses: Vec<String> = token.addresses.iter().map(ToString::to_string).collect();
