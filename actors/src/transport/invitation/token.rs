@@ -62,9 +62,15 @@ impl FromStr for Token {
     type Err = TokenError;
 
     fn from_str(text: &str) -> Result<Self, TokenError> {
-        // A terminal or a mail program may have broken a long line, and marked a quotation.
+        // A terminal, a chat or a mail program may have broken a long line with visible or invisible
+        // characters, and added quotation marks.
         let is_of_token = |c: &char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
-        let is_between = |c: char| c.is_whitespace() || matches!(c, '\u{feff}' | '\u{200b}' | '>');
+        let is_quote = |c: char| matches!(c, '"' | '\'' | '`' | '>' | '«' | '»' | '‘'..='‟');
+        let is_invisible = |c: char| {
+            matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}')
+                || matches!(c, '\u{2060}'..='\u{2069}' | '\u{feff}')
+        };
+        let is_between = |c: char| c.is_whitespace() || is_quote(c) || is_invisible(c);
         if text.chars().any(|c| !is_of_token(&c) && !is_between(c)) {
             return Err(TokenError);
         }
@@ -112,13 +118,29 @@ mod tests {
         assert_eq!(format!(" {text}\n").parse(), Ok(token.clone()));
         for at in 0..text.len() {
             let (before, after) = text.split_at(at);
-            for blank in ["\n", "\r\n  ", " ", "\n> ", "\u{a0}\u{feff}"] {
+            for blank in [
+                "\n",
+                "\r\n  ",
+                " ",
+                "\n> ",
+                "\u{a0}\u{feff}",
+                "\u{ad}\u{200d}",
+            ] {
                 assert_eq!(
                     format!("{before}{blank}{after}").parse(),
                     Ok(token.clone()),
                     "{blank:?} at {at}"
                 );
             }
+        }
+        for [before, after] in [
+            ["\"", "\""],
+            ["“", "”"],
+            ["`", "`"],
+            ["\u{2066}„", "“\u{2069}"],
+        ] {
+            let quoted = format!("{before}{text}{after}");
+            assert_eq!(quoted.parse(), Ok(token.clone()), "{quoted}");
         }
         assert!(text.replacen('-', "=", 1).parse::<Token>().is_err());
         assert!(
