@@ -47,6 +47,17 @@ fn numeric_environment_text_is_accepted() {
 }
 
 #[test]
+fn refused_numeric_text_is_explained() {
+    for text in ["1.0", "+5", "[a]"] {
+        let error = stderr(&printed(&[("ECOD_CELL", text)]));
+        assert!(
+            error.contains("ECOD_CELL") && error.contains(&format!("{text:?} must be 1 to 64")),
+            "{error}"
+        );
+    }
+}
+
+#[test]
 fn platform_variables_are_ignored() {
     let output = printed(&[
         ("ECOD_SERVICE_HOST", "10.0.0.9"),

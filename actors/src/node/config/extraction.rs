@@ -59,9 +59,13 @@ pub(super) fn extract(mut figment: Figment) -> Result<NodeConfig, LoadError> {
             errors.path.push(key);
             errors.metadata = figment.find_metadata(&errors.path.join(".")).cloned();
         }
-        // Also wrong as text: the first error is reported.
+        // Also wrong as text: the first error is reported, unless the key takes other texts.
         if let Some(first) = as_guessed.take_if(|first| first.path == errors.path) {
-            return Err(LoadError::Malformed(describe(first)));
+            let takes_text =
+                matches!(&first.kind, Kind::InvalidType(_, expected) if expected == "a string");
+            errors.metadata.clone_from(&first.metadata);
+            let reported = if takes_text { errors } else { first };
+            return Err(LoadError::Malformed(describe(reported)));
         }
         match guessed_wrong(&figment, &errors) {
             Some((key, text)) => figment = figment.merge(Serialized::default(&key, text)),
