@@ -8,12 +8,17 @@ mod process;
 mod readers;
 mod websocket;
 
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use ecod::wire::{GlobalMap, Role, Verdicts, decode};
 use ecod_actors::node::NodeHandle;
 use ecod_actors::telemetry::counters::ShedReason;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
+
+use rumqttc::v5::mqttbytes::QoS;
+use rumqttc::v5::mqttbytes::v5::{Packet, SubscribeProperties};
+use rumqttc::v5::{AsyncClient, Event, MqttOptions};
 
 use cell::{Cell, PATIENCE, Program, Round};
 use process::Node;
@@ -260,6 +265,55 @@ async fn program_receives_all_messages() {
     }
     drop(displays);
     cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn unread_topic_has_no_success() {
+    let node = Node::start();
+    let door = node.door().await;
+    let program = Program::connect("planner", door, &[]).await;
+    for topic in ["detection/edge--lidar", "nonsense", "global_detection"] {
+        let (reason, text) = program.ask(topic, b"{}".to_vec()).await;
+        assert_eq!(reason, "NoMatchingSubscribers", "{topic}");
+        assert!(text.contains(topic) && text.contains("edge--"), "{text}");
+    }
+    let _reader = Program::connect("display", door, &["+"]).await;
+    let (reason, _) = program.ask("nonsense", b"{}".to_vec()).await;
+    assert_eq!(reason, "Success", "a program reads it");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn messages_name_their_subscription() {
+    let node = Node::start();
+    let door = node.door().await;
+    let options = MqttOptions::new("display", door.ip().to_string(), door.port());
+    let (client, mut events) = AsyncClient::new(options, 8);
+    for (id, filter) in [(7, "ecod/v1/lot/global_detections"), (8, "pictures")] {
+        let properties = SubscribeProperties {
+            id: Some(id),
+            user_properties: Vec::new(),
+        };
+        client
+            .subscribe_with_properties(filter, QoS::AtMostOnce, properties)
+            .await
+            .unwrap();
+    }
+    client
+        .publish("pictures", QoS::AtMostOnce, false, "x")
+        .await
+        .unwrap();
+    let mut seen = BTreeMap::new();
+    let all = async {
+        while seen.len() < 2 {
+            if let Event::Incoming(Packet::Publish(publish)) = events.poll().await.unwrap() {
+                let ids = publish.properties.map(|p| p.subscription_identifiers);
+                seen.insert(publish.topic, ids.unwrap_or_default());
+            }
+        }
+    };
+    tokio::time::timeout(PATIENCE, all).await.unwrap();
+    let ids: Vec<_> = seen.into_values().collect();
+    assert_eq!(ids, [vec![7], vec![8]]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

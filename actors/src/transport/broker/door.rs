@@ -30,6 +30,7 @@ use ecod::wire::{
     BoxReport, CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind,
     Reputations, Topic, Topics, encode,
 };
+use rmqtt::codec::v5::PublishProperties;
 use rmqtt::context::ServerContext;
 use rmqtt::session::SessionState;
 use rmqtt::types::{ClientId, CodecPublish, From, Id, QoS, TopicFilter};
@@ -244,7 +245,8 @@ impl Door {
                              }| {
             let topic = place.topic(&topic).into();
             let qos = QoS::AtMostOnce;
-            let properties = None;
+            // See `InFlightMeter`.
+            let properties = Some(PublishProperties::default());
             let packet = CodecPublish {
                 dup: false,
                 retain,

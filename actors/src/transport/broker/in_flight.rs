@@ -124,6 +124,8 @@ impl Handler for InFlightMeter {
             return (true, before);
         };
         let mut charged = (*publish).clone();
+        // Only with properties does rmqtt give subscribers the identifiers of their subscriptions.
+        charged.properties.get_or_insert_default();
         charged.payload =
             self.in_flight
                 .charge(principal, publish.payload.clone(), self.principals.len());

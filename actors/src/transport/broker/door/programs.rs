@@ -143,7 +143,10 @@ impl Door {
         match place {
             TopicPlace::Cell if publish.retain => door.on_nodeless_message(topic, &publish.payload),
             TopicPlace::Cell => Ok(()),
-            TopicPlace::Door => door.may_publish(principal, topic),
+            TopicPlace::Door => {
+                door.may_publish(principal, topic)?;
+                door.check_readers(topic)
+            }
             TopicPlace::Inbound => match door.setup.topics.parse(topic) {
                 Some(Topic::Cell) => door.on_description(principal, &publish.payload),
                 Some(Topic::Nodes(name)) => door.on_dismissal(principal, name),
@@ -300,6 +303,30 @@ impl DoorState {
                 "programs do not publish {topic}; reports go to detections/{node}--<part>, vote_detections/{node}--<part> and boxes/{node}--<part>"
             ))),
         }
+    }
+
+    /// Checks that another program reads a topic below the cell's that is none of the cell's, such
+    /// as a misspelt one.
+    fn check_readers(&self, topic: &str) -> Result<(), DoorRefusal> {
+        let DoorSetup { topics, node, .. } = &self.setup;
+        let is_of_others = !topic.starts_with(&topics.filter(""))
+            || topic.starts_with(&topics.cpm(""))
+            || topics.parse(topic).is_some();
+        let is_read = || {
+            let filters = lock(&self.filters);
+            filters
+                .keys()
+                .any(|(_, filter)| matches(TopicPlace::of(filter).1, topic))
+        };
+        if is_of_others || is_read() {
+            return Ok(());
+        }
+        Err(DoorRefusal::new(
+            RefusalReason::Rejected(RejectReason::UnknownTopic),
+            format!(
+                "nothing reads {topic}; reports go to detections/{node}--<part>, vote_detections/{node}--<part> and boxes/{node}--<part>"
+            ),
+        ))
     }
 
     /// Handles a program's report: checks name, rate, content and use in the cell, then passes it
@@ -528,6 +555,20 @@ impl DoorState {
             levels.next().is_none_or(|level| level == "#")
         })
     }
+}
+
+/// True if a filter matches a topic (MQTT 5, section 4.7).
+fn matches(filter: &str, topic: &str) -> bool {
+    let mut levels = topic.split('/');
+    for wanted in filter.split('/') {
+        match (wanted, levels.next()) {
+            ("#", _) => return true,
+            ("+", Some(_)) => {}
+            (wanted, Some(level)) if wanted == level => {}
+            _ => return false,
+        }
+    }
+    levels.next().is_none()
 }
 
 /// True if a program's message on the topic of a node's status requests to dismiss the node: it is

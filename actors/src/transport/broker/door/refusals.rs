@@ -47,6 +47,9 @@ impl DoorRefusal {
         let code = match self.reason {
             RefusalReason::Throttled => PublishAckReason::QuotaExceeded,
             RefusalReason::Rejected(RejectReason::NotPermitted) => PublishAckReason::NotAuthorized,
+            RefusalReason::Rejected(RejectReason::UnknownTopic) => {
+                PublishAckReason::NoMatchingSubscribers
+            }
             RefusalReason::Rejected(_) => PublishAckReason::PayloadFormatInvalid,
         };
         PublishAclResult(PublishResult::reason_code(
