@@ -248,6 +248,7 @@ def test_defaults_come_from_the_environment(broker: Server, monkeypatch: pytest.
         ("broker 'mqtt://host' must be HOST:PORT", {"broker": "mqtt://host"}),
         ("broker ':1883' must be HOST:PORT", {"broker": ":1883"}),
         (r"broker '\*\*\*@host:1883' must be HOST:PORT; a login is `user` and `password`", {"broker": "mqtt://user:geh/eim1@host:1883"}),
+        ("broker 'mqtt://host' must be HOST:PORT", {"broker": "mqtt://host?password=geheim1"}),
         (r"broker '\*\*\*@host' must be HOST:PORT; a login is `user` and `password`", {"broker": "user:geheim1@host"}),
         ("cell name 'a/b' must be 1 to 64", {"cell": "a/b"}),
         ("node name 'euclid--#' must be 1 to 64", {"node": "euclid", "part": "#"}),

@@ -255,11 +255,10 @@ def host_and_port(address: str, default_port: int) -> tuple[str, int]:
             return parts.hostname, parts.port or default_port
     except ValueError:
         pass
-    # The error shows no login; its cause would.
-    login, at, host = address.rpartition("@")
+    _, at, host = address.rpartition("@")
     if at:
-        raise Invalid(f"broker {'***@' + host!r} must be HOST:PORT; a login is `user` and `password`") from None
-    raise Invalid(f"broker {address!r} must be HOST:PORT")
+        raise Invalid(f"broker '***@{host}' must be HOST:PORT; a login is `user` and `password`")
+    raise Invalid(f"broker {address.partition('?')[0]!r} must be HOST:PORT")
 
 
 class _CellContext(ssl.SSLContext):
