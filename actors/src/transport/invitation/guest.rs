@@ -29,8 +29,8 @@ use super::{
 /// Maximum time for a connection to one address of the host.
 const CONNECT_TIME: Duration = Duration::from_secs(3);
 
-/// Time between the attempts at two addresses, of which some lead nowhere from here (RFC 8305,
-/// section 5).
+/// Time between the attempts at two addresses, some of which are out of reach (RFC 8305, section
+/// 5).
 const ATTEMPT_INTERVAL: Duration = Duration::from_millis(250);
 
 /// A node that was admitted. The host counts it as joined after [`Joined::keep`].

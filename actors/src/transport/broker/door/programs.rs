@@ -305,8 +305,7 @@ impl DoorState {
         }
     }
 
-    /// Checks that another program reads a topic below the cell's that is none of the cell's, such
-    /// as a misspelt one.
+    /// Checks that a program reads an unknown topic below the cell's root, such as a misspelt one.
     fn check_readers(&self, topic: &str) -> Result<(), DoorRefusal> {
         let DoorSetup { topics, node, .. } = &self.setup;
         let is_of_others = !topic.starts_with(&topics.filter(""))
@@ -324,7 +323,7 @@ impl DoorState {
         Err(DoorRefusal::new(
             RefusalReason::Rejected(RejectReason::UnknownTopic),
             format!(
-                "nothing reads {topic}; reports go to detections/{node}--<part>, vote_detections/{node}--<part> and boxes/{node}--<part>"
+                "no program reads {topic}; reports go to detections/{node}--<part>, vote_detections/{node}--<part> and boxes/{node}--<part>"
             ),
         ))
     }
