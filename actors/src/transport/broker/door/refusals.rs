@@ -48,7 +48,7 @@ impl DoorRefusal {
             RefusalReason::Throttled => PublishAckReason::QuotaExceeded,
             RefusalReason::Rejected(RejectReason::NotPermitted) => PublishAckReason::NotAuthorized,
             RefusalReason::Rejected(RejectReason::UnknownTopic) => {
-                PublishAckReason::NoMatchingSubscribers
+                PublishAckReason::TopicNameInvalid
             }
             RefusalReason::Rejected(_) => PublishAckReason::PayloadFormatInvalid,
         };
