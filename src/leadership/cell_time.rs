@@ -10,6 +10,8 @@
 //!   that differ, it uses the value nearer to the current cell time. One node's clock can therefore
 //!   move the cell's time only in cells with a single candidate.
 //! - A wall clock before [`EARLIEST`] counts as unset and is ignored.
+//! - The parts of a node, such as observers, share its certificate and its machine's clock. Only the
+//!   node's own statement counts, so that one certificate is one clock.
 //! - A new leader continues with the old leader's time. Small errors are slewed away; larger errors
 //!   make the cell's time jump.
 //! - A follower's stamps don't depend on its own wall clock, so a step of that clock does no harm.
@@ -167,16 +169,15 @@ impl CellTime {
     }
 
     /// Errors of all available wall clocks in microseconds, positive if ahead of the cell's time:
-    /// first the node's own (without a name), then those of the other nodes. Empty until the node
-    /// has a cell time.
+    /// first the node's own (without a name), then those of the other nodes, without their parts.
+    /// Empty until the node has a cell time.
     pub fn wall_errors(&self, now: Timestamp) -> Vec<(Option<&NodeName>, i64)> {
         let Some(cell) = self.reading.map(|reading| reading.offset_us) else {
             return Vec::new();
         };
         let own = self.wall_offset_us.map(|wall| (None, wall));
         let others = self
-            .peers
-            .iter()
+            .nodes()
             .filter_map(|(name, peer)| Some((Some(name), peer.wall_offset_us(now)?)));
         own.into_iter()
             .chain(others)
@@ -335,13 +336,18 @@ impl CellTime {
     /// The wall clocks of all candidates that were set, as offsets from this node's steady clock.
     fn walls(&self, now: Timestamp) -> Vec<i64> {
         let is_set = |offset: &i64| self.is_candidate && now.shifted(*offset) >= EARLIEST;
-        let candidates = self.peers.values().filter(|peer| peer.is_candidate);
-        let others = candidates.filter_map(|peer| peer.wall_offset_us(now));
+        let candidates = self.nodes().filter(|(_, peer)| peer.is_candidate);
+        let others = candidates.filter_map(|(_, peer)| peer.wall_offset_us(now));
         self.wall_offset_us
             .filter(is_set)
             .into_iter()
             .chain(others)
             .collect()
+    }
+
+    /// The other nodes, without their parts.
+    fn nodes(&self) -> impl Iterator<Item = (&NodeName, &PeerClock)> {
+        self.peers.iter().filter(|(name, _)| !name.is_part())
     }
 }
 

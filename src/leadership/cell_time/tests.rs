@@ -363,6 +363,31 @@ fn agreeing_clocks_are_not_reported() {
     );
 }
 
+/// The observers of one vehicle agree on a wrong time; the other nodes' clocks stay right.
+#[test]
+fn parts_state_no_clocks() {
+    let ahead = 10 * SECOND_US;
+    let mut nodes = vec![(Role::Edge, 0, 0), (Role::Cav, 0, 0), (Role::Cav, 0, ahead)];
+    nodes.extend([(Role::Auto, 0, ahead); 8]);
+    let mut cell = Cell::new(&nodes);
+    for (part, node) in cell.nodes.iter_mut().skip(3).enumerate() {
+        node.name = NodeName::new(format!("n2--{part}")).unwrap();
+    }
+    cell.run(10);
+    let wrong = |index: usize| {
+        let Node {
+            time, steady_us, ..
+        } = &cell.nodes[index];
+        let wrong = time.wrong_clocks(cell.now.shifted(*steady_us)).into_iter();
+        wrong
+            .map(|clock| clock.node.map(NodeName::to_string))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(wrong(0), [Some("n2".to_owned())]);
+    assert_eq!(wrong(1), [], "a follower's own clock is right");
+    assert!(cell.errors()[0].abs() < 5_000, "{:?}", cell.errors());
+}
+
 #[test]
 fn false_stamps_move_no_time() {
     let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Auto, 0, 0)]);

@@ -57,7 +57,7 @@ pub struct ElectionDriver {
     is_visitor: bool,
     /// Nodes whose absence is a trouble.
     missing: BTreeSet<NodeName>,
-    /// Nodes that declared more than their certificate allows.
+    /// Holders of certificates that declared more than these allow, as themselves or as a part.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
     /// The leader's last complaint about this node: the leader and the trouble.
@@ -360,7 +360,7 @@ impl ElectionDriver {
                 self.counters.count(Event::Overreached);
                 self.counters
                     .reject(RejectReason::NotPermitted, from.as_str());
-                if self.overreached.insert(from.clone()) {
+                if self.overreached.insert(from.vehicle()) {
                     tracing::warn!(
                         %from, %role, priority, allowed_role = %rights.role, allowed_priority = rights.priority,
                         "a node declares more than its certificate allows; the role and priority of the certificate \
