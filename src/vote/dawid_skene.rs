@@ -91,7 +91,7 @@ pub(super) struct DawidSkene {
     shares: ClassShares,
 }
 
-/// The shares of the classes among landmarks.
+/// The shares of the classes among landmarks with several votes.
 #[derive(Debug, Clone, Default)]
 struct ClassShares {
     /// Expected number of landmarks of each label, and one landmark that is assumed.
@@ -340,18 +340,22 @@ impl DawidSkene {
         }
     }
 
-    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote is not evidence
-    /// about its vehicle.
+    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote is not evidence:
+    /// neither about its vehicle, nor about the shares of the classes, because a vehicle could
+    /// invent any number of landmarks.
     pub(super) fn add_live(
         &mut self,
         votes: &[WeightedVote],
         posterior: &[(LabelIndex, f64)],
         sign: f64,
     ) {
+        if votes.len() < 2 {
+            return;
+        }
         for &(truth, p) in posterior {
             self.shares.add(truth, sign * p);
         }
-        for vote in votes.iter().filter(|_| votes.len() > 1) {
+        for vote in votes {
             let weight = sign * vote.weight.min(1.0);
             let live = &mut self.vehicles[vote.vehicle].live;
             live.add(vote.label, posterior.iter().copied(), weight);

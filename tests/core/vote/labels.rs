@@ -77,6 +77,28 @@ fn new_labels_survive_label_flood() {
     assert!(honest.score > 0.7 && honest.correct > 20, "{honest:?}");
 }
 
+/// Votes that no other vehicle can check do not make a label frequent elsewhere.
+#[test]
+fn sole_votes_favour_no_label() {
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    for round in 1..10 {
+        let mut invented: Vec<_> = (0..900)
+            .map(|place| vote_for(&format!("nowhere-{place}"), "invented"))
+            .collect();
+        invented.push(vote_for("known", "invented"));
+        vote_as(&mut vote, "liar", round, &invented);
+        for honest in ["a", "b"] {
+            vote_as(&mut vote, honest, round, &[vote_for("known", "cup")]);
+        }
+        let verdicts = vote
+            .close(START + ROUND * u32::try_from(round).unwrap())
+            .verdicts;
+        let known = verdicts.iter().find(|v| v.landmark.as_str() == "known");
+        let label = known.and_then(|verdict| verdict.label.as_deref());
+        assert_eq!(label, Some("cup"), "round {round}");
+    }
+}
+
 #[test]
 fn lone_vehicle_keeps_latest_labels() {
     let mut vote = Vote::new(
