@@ -10,6 +10,9 @@
 //!   every round. The end is therefore delayed a little while reports arrive. If a round still ends
 //!   between them, the remaining vehicles get a round as soon as the last of them has reported;
 //!   later rounds then end after all reports.
+//! - A vehicle, with all its parts, closes a round early only four fifths of a period after its
+//!   last report in an earlier round. A vehicle that reports more often than the others thus sets no
+//!   higher rate of maps.
 //!
 //! Call [`RoundTrigger::report`] for every admitted report and [`RoundTrigger::tick`] at
 //! [`RoundTrigger::deadline`]; either returns true when the round closes.
@@ -59,6 +62,11 @@ pub struct RoundTrigger {
     last_close: Timestamp,
     /// Time of the first report of the current round.
     first_report: Option<Timestamp>,
+    /// Time from which on the reports of the current round may close it early.
+    early_from: Option<Timestamp>,
+    /// Time of each vehicle's last report in the current round, and in earlier rounds.
+    reported: BTreeMap<NodeName, Timestamp>,
+    reported_before: BTreeMap<NodeName, Timestamp>,
     live: [BTreeMap<NodeName, Reporter>; ReportKind::COUNT],
     /// Number of live vehicles that have not reported in the current round.
     missing: usize,
@@ -149,10 +157,15 @@ const LIVE_INTERVALS: u32 = 3;
 /// rounds.
 const REMEMBERED: Duration = Duration::from_secs(3);
 
-/// Maximum number of rounds in a period. The first rounds of a leadership are exempt, and so are
+/// Maximum number of rounds in a period, if several vehicles report in it. The first rounds of a leadership are exempt, and so are
 /// the rounds that immediately follow with the reports of vehicles that were due. They are few,
 /// because a vehicle is not due again for half a period.
 const MAX_RATE: u32 = 5;
+
+/// Least part of a period between a vehicle's last report in one round and its report that closes a
+/// later round early. It is less than a period, so that reports come in time despite jitter, and at
+/// slightly more than one per period.
+const VEHICLE_PACE: f64 = 0.8;
 
 /// Inverse share of a period by which the end of a round is delayed after its first report.
 const DELAY_DIVISOR: u32 = 10;
@@ -166,6 +179,9 @@ impl RoundTrigger {
         Self {
             last_close: now,
             first_report: None,
+            early_from: None,
+            reported: BTreeMap::new(),
+            reported_before: BTreeMap::new(),
             live: Default::default(),
             missing: 0,
             due: 0,
@@ -188,6 +204,7 @@ impl RoundTrigger {
     /// that arrive at its end.
     pub fn report(&mut self, kind: ReportKind, node: &NodeName, now: Timestamp) -> bool {
         self.first_report.get_or_insert(now);
+        let early_from = self.early_from_report(node.vehicle(), now);
         let live = &mut self.live[kind as usize];
         let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
@@ -203,11 +220,23 @@ impl RoundTrigger {
         if was_last_due
             && !self.held
             && now.since(self.last_close) < self.config.period() / MAX_RATE
+            && now >= early_from
         {
             self.close(now);
             return true;
         }
         self.missing == 0 && self.tick(now)
+    }
+
+    /// Records a report of a vehicle or its part; returns the time from which on the vehicle's
+    /// reports may close the round early.
+    fn early_from_report(&mut self, vehicle: NodeName, now: Timestamp) -> Timestamp {
+        let pace = self.config.period().mul_f64(VEHICLE_PACE);
+        let before = self.reported_before.get(&vehicle);
+        let early_from = before.map_or(now, |before| *before + pace);
+        self.early_from = Some(self.early_from.unwrap_or(early_from).min(early_from));
+        self.reported.insert(vehicle, now);
+        early_from
     }
 
     /// True when the round closes now; call it at the latest at [`Self::deadline`].
@@ -238,8 +267,12 @@ impl RoundTrigger {
                 self.due += usize::from(vehicle.due);
             }
         }
+        self.reported_before.append(&mut self.reported);
+        self.reported_before
+            .retain(|_, reported_at| now.since(*reported_at) < period);
         self.last_close = now;
         self.first_report = None;
+        self.early_from = None;
         self.held = self.early < EARLY.len();
         self.length = EARLY
             .get(self.early)
@@ -273,12 +306,14 @@ impl RoundTrigger {
         if self.config.close == RoundClose::Periodic || self.held {
             return end;
         }
-        match self.first_report {
-            Some(_) if self.missing == 0 => self.last_close + period / MAX_RATE,
-            Some(first) => end
+        match (self.early_from, self.first_report) {
+            (Some(early_from), _) if self.missing == 0 => {
+                early_from.max(self.last_close + period / MAX_RATE).min(end)
+            }
+            (_, Some(first)) => end
                 .max(first + period / DELAY_DIVISOR)
                 .min(end + period / DELAY_DIVISOR),
-            None => end,
+            (_, None) => end,
         }
     }
 }
@@ -511,9 +546,69 @@ mod tests {
             .filter(|ms| rounds.report(Detections, &node("a"), at(*ms)))
             .count();
         assert!(
-            (45..=50).contains(&closed),
+            (11..=13).contains(&closed),
             "{closed} rounds in a second at a period of 100 ms"
         );
+    }
+
+    /// Rounds in five seconds in a cell whose three cameras report twice a second, while the parts
+    /// of another vehicle report in turn every `every_ms`.
+    fn rounds_beside(parts: u64, every_ms: u64) -> usize {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        let mut closed = 0;
+        for ms in 0..5000 {
+            closed += usize::from(rounds.tick(at(ms)));
+            for (camera, phase) in [("a", 7), ("b", 9), ("c", 12)] {
+                if ms % 500 == phase {
+                    closed += usize::from(rounds.report(Detections, &node(camera), at(ms)));
+                }
+            }
+            if ms.is_multiple_of(every_ms) {
+                let part = node(&format!("m--{}", ms / every_ms % parts));
+                closed += usize::from(rounds.report(Detections, &part, at(ms)));
+            }
+        }
+        closed
+    }
+
+    #[test]
+    fn fast_vehicle_adds_few_rounds() {
+        for (parts, every_ms) in [
+            (1, 10),
+            (1, 1),
+            (1, 33),
+            (1, 66),
+            (16, 20),
+            (16, 7),
+            (8, 60),
+        ] {
+            let closed = rounds_beside(parts, every_ms);
+            assert!(
+                closed <= 5000 / 80 + 3 * 5000 / 500,
+                "{closed} rounds with {parts} parts that report every {every_ms} ms"
+            );
+        }
+    }
+
+    /// Vehicles whose reports come 12 times a second, or at jittered times, get them fused at once.
+    #[test]
+    fn jittered_reports_are_not_delayed() {
+        for jitter_ms in [[0, 0, 0, 0], [9, 0, 5, 1], [0, 10, 0, 10]] {
+            for every_ms in [92, 95, 100, 105] {
+                let mut rounds = trigger(RoundClose::WhenComplete);
+                let mut open = 0;
+                for frame in 3..60 {
+                    let begin = frame * every_ms + jitter_ms[frame as usize % 4];
+                    while rounds.deadline() < at(begin) {
+                        assert!(rounds.tick(rounds.deadline()));
+                    }
+                    rounds.report(Detections, &node("a"), at(begin));
+                    let closed = rounds.report(Detections, &node("b"), at(begin + 1));
+                    open += u64::from(frame > 10 && !closed);
+                }
+                assert!(open <= 1, "{open} at {every_ms} ms, {jitter_ms:?}");
+            }
+        }
     }
 
     #[test]
