@@ -23,6 +23,7 @@ mod orientation;
 mod report_doubt;
 #[cfg(test)]
 mod tests;
+mod verdict_share;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -39,6 +40,7 @@ use nalgebra::Point2;
 use neighbouring::NeighbourView;
 use orientation::OrientationCheck;
 use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
+use verdict_share::VerdictShare;
 
 use crate::admission::report_window::{Admitted, ReportWindow};
 use crate::admission::timeliness::Timeliness;
@@ -110,6 +112,7 @@ pub struct Aggregator {
     expelled: Expelled,
     neighbours: NeighbourView,
     vote: Option<Vote>,
+    verdict_share: VerdictShare,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty
     /// verdicts.
@@ -154,6 +157,7 @@ impl Aggregator {
             expelled: Expelled::default(),
             neighbours: NeighbourView::default(),
             vote,
+            verdict_share: VerdictShare::default(),
             by_packets,
             voted: false,
         }
@@ -389,16 +393,22 @@ impl Aggregator {
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// Evaluates the incomplete packet of VOTE's `paper` mode in a separate round, at the end of a
-    /// recording. `None` if no packet was begun, or without leadership.
-    pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
+    /// The remaining verdicts as a separate round, at the end of a recording: those that wait for
+    /// their vehicle's share, and those of the incomplete packet of VOTE's `paper` mode. `None` if
+    /// there are neither, or without leadership.
+    pub fn end_recording(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
-        let by_packets = self.by_packets;
-        let vote = self
-            .vote
-            .as_mut()
-            .filter(|vote| by_packets && vote.is_packet_begun())?;
-        let verdicts = vote.close(now).verdicts;
+        let vote = self.vote.as_mut()?;
+        let is_packet_begun = self.by_packets && vote.is_packet_begun();
+        if !is_packet_begun && self.verdict_share.is_empty() {
+            return None;
+        }
+        let verdicts = if is_packet_begun {
+            vote.close(now).verdicts
+        } else {
+            Vec::new()
+        };
+        let verdicts = self.verdict_share.drain(verdicts, vote);
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
@@ -578,11 +588,16 @@ impl Aggregator {
                 wanted
             }
         };
-        let vote = self
-            .vote
-            .as_mut()
-            .filter(is_due)
-            .map(|vote| vote.close(now));
+        let verdict_share = &mut self.verdict_share;
+        let vote = self.vote.as_mut().filter(is_due).map(|vote| {
+            let mut round = vote.close(now);
+            if vote.is_open() {
+                round.verdicts = verdict_share.limit(round.verdicts, vote);
+            } else {
+                *verdict_share = VerdictShare::default();
+            }
+            round
+        });
         if let (Some(tracks), Some(vote)) = (&mut self.tracks, &vote) {
             tracks.learn(&vote.evidence);
         }

@@ -271,7 +271,7 @@ impl Replay {
         if let Some(cell) = &mut self.cell {
             let last = match self.config.passes {
                 Some(passes) => cell.refine(passes, self.clock.now()),
-                None => cell.end_packet(end),
+                None => cell.end_recording(end),
             };
             self.summary.written += u64::from(last.is_some());
             output.extend(last.map(FusedLine::Verdicts));

@@ -492,6 +492,16 @@ impl Vote {
         self.method.get_mut().begin_record(now);
     }
 
+    /// True if reports name the landmarks themselves.
+    pub(crate) fn is_open(&self) -> bool {
+        self.open
+    }
+
+    /// The verdict of a landmark as of the last round; `None` for an unknown landmark.
+    pub(crate) fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
+        self.method.get().verdict(landmark)
+    }
+
     /// The verdict of every landmark as of the last round, by landmark.
     pub fn verdicts(&self) -> impl Iterator<Item = Verdict> {
         self.landmarks

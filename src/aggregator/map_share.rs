@@ -7,16 +7,16 @@ use crate::model::names::{Label, NodeName};
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
 /// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
-/// parts: about 330 objects with short labels. Ten maps per second then take about
+/// parts, and of a round's verdicts on which only one vehicle voted: about 330 objects with short labels. Ten maps per second then take about
 /// 11 Mbit/s of a link. Without this bound, one member's reports could make the map too large for the links
 /// to carry once per round.
-const MAX_SOLE_BYTES: usize = 128 * 1024;
+pub(super) const MAX_SOLE_BYTES: usize = 128 * 1024;
 
 /// Size in JSON of an object without its texts.
 const NUMBERS_BYTES: usize = 352;
 
 /// Size in JSON of one score without its label.
-const SCORE_BYTES: usize = 25;
+pub(super) const SCORE_BYTES: usize = 25;
 
 /// Removes the objects beyond each vehicle's share, the least certain first and of equally certain
 /// ones the last, and returns the removed entries.
@@ -49,7 +49,6 @@ pub(super) fn limit_shares(objects: &mut Vec<FusedObject>) -> Vec<InvalidEntry> 
 
 /// About the size of an object in JSON.
 fn bytes_of(object: &FusedObject) -> usize {
-    let escaped = |label: &Label| label.len() + label.matches(['"', '\\']).count();
     let scores = object
         .scores
         .keys()
@@ -60,6 +59,11 @@ fn bytes_of(object: &FusedObject) -> usize {
         .chain(&object.vehicle)
         .map(|name| name.as_str().len());
     NUMBERS_BYTES + escaped(&object.label) + scores.sum::<usize>() + names.sum::<usize>()
+}
+
+/// Size in JSON of a label without its quotation marks.
+pub(super) fn escaped(label: &Label) -> usize {
+    label.len() + label.matches(['"', '\\']).count()
 }
 
 #[cfg(test)]

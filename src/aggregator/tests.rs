@@ -237,6 +237,60 @@ fn successive_expulsions_remove_shared_object() {
     assert_eq!(contributors(&mut cell, 30..32), Vec::<Vec<NodeName>>::new());
 }
 
+/// Bytes in JSON of the verdicts of a round, and their landmarks.
+fn size_of(fused: Option<Fused>) -> (usize, Vec<LandmarkId>) {
+    let verdicts = fused.and_then(|fused| fused.verdicts).unwrap();
+    let bytes = serde_json::to_vec(&verdicts).unwrap().len();
+    let landmarks = verdicts.verdicts.into_iter();
+    (bytes, landmarks.map(|verdict| verdict.landmark).collect())
+}
+
+/// A vehicle alone names 1000 places in each round, with labels that take much room.
+#[test]
+fn sole_verdicts_are_spread_over_rounds() {
+    let round = RoundConfig {
+        close: RoundClose::Periodic,
+        ..RoundConfig::default()
+    };
+    let config = FusionConfig {
+        algorithms: Algorithms::Vote,
+        round,
+        ..FusionConfig::default()
+    };
+    let mut cell = Aggregator::new(NodeName::from_static("edge"), 7, config, vec![], at(0));
+    let mut rounds_of: BTreeMap<LandmarkId, usize> = BTreeMap::new();
+    for round in 1..=20 {
+        let now = at(round * 100);
+        for node in ["euclid", "gauss"] {
+            let report = report(node, "cup", round * 100 - 20);
+            cell.report(VoteDetections, &report, at(round * 100 - 10))
+                .unwrap();
+        }
+        let place = |number: u32| PerceivedObject {
+            landmark: Some(format!("nowhere-{number}").into()),
+            ..PerceivedObject::new("\"".repeat(64).as_str(), 0.9, 1.0, 0.0)
+        };
+        let invented = ObjectReport {
+            objects: (0..1000).map(place).collect(),
+            ..ObjectReport::new(
+                NodeName::from_static("mallory"),
+                round,
+                at(round * 100 - 20),
+            )
+        };
+        cell.report(VoteDetections, &Arc::new(invented), at(round * 100 - 10))
+            .unwrap();
+        let (bytes, landmarks) = size_of(cell.tick(now));
+        assert!(bytes < 160 * 1024, "{bytes} bytes in round {round}");
+        assert!(landmarks.contains(&"ball".into()), "round {round}");
+        for landmark in landmarks {
+            *rounds_of.entry(landmark).or_default() += 1;
+        }
+    }
+    assert_eq!(rounds_of.len(), 1001, "no place is left out for good");
+    assert!(rounds_of.values().all(|rounds| *rounds >= 4), "all in turn");
+}
+
 #[test]
 fn map_and_verdicts_close_together() {
     let round = RoundConfig {

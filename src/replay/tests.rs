@@ -125,6 +125,22 @@ fn open_cell_learns_landmarks() {
     );
 }
 
+/// One report that names more places than fit in a round's verdicts.
+#[test]
+fn last_report_loses_no_verdict() {
+    let label = "\"".repeat(64);
+    let places: Vec<_> = (0..1000).map(|place| format!("place-{place}")).collect();
+    let votes: Vec<_> = places
+        .iter()
+        .map(|place| (place.as_str(), label.as_str()))
+        .collect();
+    let (output, _) = replay(
+        ReplayConfig::default(),
+        [vote_line(&report("a", 0, &votes))],
+    );
+    assert_eq!(verdict_labels(&output).len(), 1000);
+}
+
 #[test]
 fn output_covers_reported_kind_only() {
     let lines: Vec<_> = (0..5)
