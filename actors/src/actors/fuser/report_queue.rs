@@ -19,6 +19,10 @@ const MAX_OBJECTS_HZ: u32 = 6_000;
 /// Maximum number of objects at once, unless one report may have more. More would delay the round.
 const OBJECT_BURST: u32 = 1_024;
 
+/// Bytes of the names of seen locations that count as one object: they cost less processor time,
+/// but as much space in a recording.
+const SEEN_BYTES_PER_OBJECT: usize = 64;
+
 /// Queue filled by the links' tasks and emptied by the fuser. It holds at most one report of each
 /// vehicle and kind, so that a flood from one vehicle does not delay other vehicles, and accepts at
 /// most `MAX_OBJECTS_HZ` objects per second of each vehicle.
@@ -85,7 +89,7 @@ impl LatestReportQueue {
                 is_over_budget: false,
             };
         }
-        let count = u32::try_from(report.objects.len()).unwrap_or(u32::MAX);
+        let count = objects_in(report);
         let received_at = delivery.received_at;
         if count > 0
             && !waiting
@@ -120,6 +124,16 @@ impl LatestReportQueue {
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// Number of objects as which a report counts. Names alone do not exceed the burst, so that the
+/// vehicle can send the report at all.
+fn objects_in(report: &ObjectReport) -> u32 {
+    let seen = report.seen.iter().flatten().map(|id| id.len());
+    let names = seen.sum::<usize>() / SEEN_BYTES_PER_OBJECT;
+    let count = |objects: usize| u32::try_from(objects).unwrap_or(u32::MAX);
+    let objects = count(report.objects.len());
+    count(report.objects.len() + names).min(objects.max(OBJECT_BURST))
 }
 
 #[cfg(test)]
@@ -219,5 +233,31 @@ mod tests {
                 "an honest vehicle with many objects at 10 Hz is not limited"
             );
         }
+    }
+
+    #[test]
+    fn seen_locations_cost_budget() {
+        let queue = LatestReportQueue::new(1_024);
+        let push = |node: &str, at_us: u64, seen: &str| {
+            let report = ObjectReport {
+                seen: Some(vec![seen.into(); 1024]),
+                ..ObjectReport::new(NodeName::new(node).unwrap(), at_us, Timestamp(at_us))
+            };
+            let delivery = QueuedReport {
+                kind: ReportKind::Detections,
+                report: Arc::new(report),
+            };
+            !queue
+                .push(Delivery::local(delivery, Timestamp(at_us)))
+                .is_over_budget
+        };
+        let start = 1_000_000_000;
+        let long = "x".repeat(64);
+        let accepted = (0..100)
+            .filter(|number| push("mallory", start + number * 10_000, &long))
+            .count();
+        assert!((5..8).contains(&accepted), "{accepted} in a second");
+        let all = (0..100).all(|number| push("euclid", start + number * 100_000, "slot-1023"));
+        assert!(all, "short names of all places at 10 Hz are not limited");
     }
 }
