@@ -126,8 +126,7 @@ impl ElectionDriver {
     /// expelled node and a change of this machine's address concern other actors.
     pub(super) async fn on_membership_event(&mut self, event: MembershipEvent) {
         if let MembershipEvent::Alive { member } | MembershipEvent::Changed { member } = &event {
-            self.life_signs
-                .member_up(&member.name, member.certificate.as_ref());
+            self.life_signs.member_up(member);
         }
         let input = match event {
             MembershipEvent::Alive { member } => Input::MemberAlive {

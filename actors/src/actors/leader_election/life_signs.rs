@@ -12,17 +12,19 @@ use base64::engine::general_purpose::STANDARD as BASE64;
 use ecod::leadership::election::{Body, ElectionMessage, LifeSign};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
+use ecod::wire::Role;
 
+use crate::transport::gossip::Member;
 use crate::transport::pki::{Credentials, is_signed_by};
 
-/// Maximum number of nodes whose certificates are kept.
+/// Maximum number of candidates whose certificates are kept.
 const MAX_CERTIFICATES: usize = 4096;
 
 /// Signs this node's signs of life, and verifies other leaders' signs of life.
 pub(super) struct LifeSigns {
     cell: NodeName,
     credentials: Option<Arc<Credentials>>,
-    /// Certificates with which other nodes have proven their identity.
+    /// Certificates with which other candidates have proven their identity.
     certificates: BTreeMap<NodeName, Arc<[u8]>>,
     /// The last sign of life that was signed, and its leadership.
     signed: Option<(Epoch, LifeSign)>,
@@ -45,14 +47,17 @@ impl LifeSigns {
         self.credentials.as_deref()
     }
 
-    /// Stores the certificate of a node that has proven it.
-    pub(super) fn member_up(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
-        let Some(certificate) = certificate else {
+    /// Stores the certificate of a node that may lead. A certificate has any number of observers,
+    /// which may not.
+    pub(super) fn member_up(&mut self, member: &Member) {
+        let Some(certificate) = &member.certificate else {
             return;
         };
-        if self.certificates.len() < MAX_CERTIFICATES || self.certificates.contains_key(name) {
+        let has_room = self.certificates.len() < MAX_CERTIFICATES
+            || self.certificates.contains_key(&member.name);
+        if member.role != Role::Cav && has_room {
             self.certificates
-                .insert(name.clone(), Arc::clone(certificate));
+                .insert(member.name.clone(), Arc::clone(certificate));
         }
     }
 
@@ -118,7 +123,7 @@ mod tests {
     use std::time::Duration;
 
     use ecod::leadership::election::Candidacy;
-    use ecod::wire::{Role, SCHEMA_VERSION};
+    use ecod::wire::SCHEMA_VERSION;
 
     use super::*;
     use crate::platform::clock;
@@ -142,6 +147,18 @@ mod tests {
             body,
             clock: None,
             description: None,
+        }
+    }
+
+    fn member(name: &str, role: Role, credentials: &Credentials) -> Member {
+        let gossip = "127.0.0.1:1".parse().unwrap();
+        Member {
+            name: NodeName::new(name).unwrap(),
+            run: 1,
+            gossip,
+            broker: None,
+            role,
+            certificate: Some(credentials.current().certificate().into()),
         }
     }
 
@@ -197,10 +214,7 @@ mod tests {
             !seeker.is_proven(&evidence(life_of(&edge, 500))),
             "a leader without contact so far"
         );
-        seeker.member_up(
-            &NodeName::from_static("edge"),
-            Some(&edge.current().certificate().into()),
-        );
+        seeker.member_up(&member("edge", Role::Edge, &edge));
         assert!(seeker.is_proven(&evidence(life_of(&edge, 500))));
         assert!(
             !seeker.is_proven(&evidence(life_of(&euclid, 500))),
@@ -221,5 +235,24 @@ mod tests {
             ..evidence(life_of(&edge, 500))
         };
         assert!(!seeker.is_proven(&of_later_term), "of another leadership");
+    }
+
+    #[test]
+    fn observers_displace_no_certificate() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = NodeName::from_static("lot");
+        let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
+        let edge = NodeName::from_static("edge");
+        authority
+            .issue(&edge, Role::Edge, Duration::from_secs(60), clock::now())
+            .unwrap();
+        let credentials = Arc::new(Credentials::load(&authority.tls_of(&edge), &edge).unwrap());
+        let mut seeker = LifeSigns::new(cell, Some(Arc::clone(&credentials)));
+        for number in 0..MAX_CERTIFICATES {
+            let observer = format!("mallory--{number}");
+            seeker.member_up(&member(&observer, Role::Cav, &credentials));
+        }
+        seeker.member_up(&member("edge", Role::Edge, &credentials));
+        assert_eq!(seeker.certificates.keys().collect::<Vec<_>>(), [&edge]);
     }
 }
