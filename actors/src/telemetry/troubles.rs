@@ -3,6 +3,7 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use ecod::diagnostics::{TroubleKind, TroubleRegister};
+use ecod::model::names::plain_text;
 use ecod::wire::Trouble;
 
 use crate::platform::clock;
@@ -76,6 +77,16 @@ impl Troubles {
     fn register(&self) -> MutexGuard<'_, TroubleRegister> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// Maximum number of characters of a member's text in a trouble.
+const MAX_QUOTED_CHARACTERS: usize = 120;
+
+/// Another member's text as a quotation.
+pub(crate) fn quoted(text: &str) -> String {
+    let words: String = text.chars().take(MAX_QUOTED_CHARACTERS).collect();
+    let end = if words.len() < text.len() { "…" } else { "" };
+    format!("“{}{end}”", plain_text(&words, words.len()))
 }
 
 fn log(news: Option<Trouble>) {

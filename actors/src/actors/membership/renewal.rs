@@ -11,6 +11,7 @@ use ecod::model::time::Timestamp;
 use crate::messages::membership::RenewalOutcome;
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
+use crate::telemetry::troubles::quoted;
 use crate::transport::pki::{Credentials, NewKey, RenewalMessage, renew};
 
 /// Renewals of one node. It decides what to send, and which work with files runs outside the
@@ -72,9 +73,6 @@ const MESSAGE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Nodes whose last answer is stored.
 const MAX_ANSWERED: usize = 1024;
-
-/// Most bytes of another node's reason that are shown.
-const MAX_REASON: usize = 120;
 
 const NO_HOLDER: &str = "no node that has the key of the cell's CA answers";
 const WRONG_CLOCK: &str = "this machine's clock is wrong";
@@ -171,9 +169,9 @@ impl Renewals {
                     RenewalOutcome::Replaced(installed.map_err(|error| error.to_string()))
                 })))
             }
-            RenewalMessage::Refused(mut reason) => {
+            RenewalMessage::Refused(reason) => {
                 if let Some(pending) = &mut self.own {
-                    reason.truncate(reason.floor_char_boundary(MAX_REASON));
+                    let reason = quoted(&reason);
                     pending.refusal = Some(format!("{from} does not renew it: {reason}"));
                 }
                 None
@@ -315,8 +313,22 @@ mod tests {
         _ = renewals.check(NOW + ANSWER_TIME);
         assert_eq!(
             credentials.unrenewed().as_deref(),
-            Some("gauss does not renew it: it was revoked")
+            Some("gauss does not renew it: “it was revoked”")
         );
+    }
+
+    #[test]
+    fn refusal_is_quoted_and_cut() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut renewals = renewals(&directory);
+        let credentials = Arc::clone(&renewals.credentials);
+        _ = renewals.check(NOW);
+        let reason = format!("{}\u{202E}\n", "é".repeat(118)).repeat(2);
+        let message = RenewalMessage::Refused(reason);
+        assert!(renewals.on_message(GAUSS, &[], message, NOW).is_none());
+        _ = renewals.check(NOW + ANSWER_TIME);
+        let shown = format!("gauss does not renew it: “{}  …”", "é".repeat(118));
+        assert_eq!(credentials.unrenewed(), Some(shown));
     }
 
     #[test]

@@ -15,6 +15,7 @@ use ecod::wire::WirePose;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
 
+use crate::telemetry::troubles;
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
 
@@ -66,9 +67,6 @@ pub const MAX_SHOWN: usize = 256;
 /// leader may report, including its parts.
 const MAX_SHOWN_TROUBLES: usize = 64;
 const MAX_TROUBLES_OF_ONE: usize = 4;
-
-/// Maximum length of a member's text on the page, in characters.
-const MAX_QUOTED_CHARACTERS: usize = 120;
 
 /// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
@@ -266,7 +264,7 @@ impl LiveState {
                 && known.insert((subject(trouble, by), trouble.kind.clone()));
             if is_shown {
                 *room -= 1;
-                all.push((Some(by.clone()), quoted(trouble)));
+                all.push((Some(by.clone()), as_quotation(trouble)));
             }
         }
         all
@@ -278,15 +276,11 @@ impl LiveState {
 }
 
 /// A member's trouble with its text as a quotation, and this node's remedy for the kind.
-fn quoted(trouble: &Trouble) -> Trouble {
+fn as_quotation(trouble: &Trouble) -> Trouble {
     let remedy =
         TroubleKind::named(&trouble.kind).map_or("see the log of that node", TroubleKind::remedy);
-    let mut words: String = trouble.cause.chars().take(MAX_QUOTED_CHARACTERS).collect();
-    if words.len() < trouble.cause.len() {
-        words.push('…');
-    }
     Trouble {
-        cause: format!("“{words}”"),
+        cause: troubles::quoted(&trouble.cause),
         remedy: remedy.to_owned(),
         ..trouble.clone()
     }
