@@ -7,9 +7,10 @@ use crate::model::names::{Label, NodeName};
 use crate::wire::{FusedObject, InvalidEntry, RejectReason};
 
 /// Maximum size in JSON of the objects in a map that only one vehicle has reported, including its
-/// parts, and of a round's verdicts on which only one vehicle voted: about 330 objects with short labels. Ten maps per second then take about
-/// 11 Mbit/s of a link. Without this bound, one member's reports could make the map too large for the links
-/// to carry once per round.
+/// parts: about 330 objects with short labels. It is also the maximum size of a round's verdicts on
+/// which only one vehicle voted. Ten maps per second then take about 11 Mbit/s of a link. Without
+/// this bound, one member's reports could make the map too large for the links to carry once per
+/// round.
 pub(super) const MAX_SOLE_BYTES: usize = 128 * 1024;
 
 /// Size in JSON of an object without its texts.

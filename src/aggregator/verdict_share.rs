@@ -9,21 +9,21 @@ use crate::vote::Vote;
 use crate::wire::Verdict;
 
 /// Size in JSON of a verdict without its texts.
-const NUMBERS_BYTES: usize = 110;
+const VERDICT_BYTES: usize = 110;
 
 /// Landmarks whose verdicts wait, at most one entry of each.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VerdictShare {
     /// By the only voter, or `None` if there is none any more; those that wait longest first.
     waiting: BTreeMap<Option<NodeName>, BTreeMap<u64, LandmarkId>>,
-    places: BTreeMap<LandmarkId, WaitingPlace>,
+    positions: BTreeMap<LandmarkId, QueuePosition>,
     /// Number of the next entry.
     next: u64,
 }
 
-/// The place of a landmark among those that wait.
+/// The position of a landmark among those that wait.
 #[derive(Debug, Clone)]
-struct WaitingPlace {
+struct QueuePosition {
     voter: Option<NodeName>,
     number: u64,
 }
@@ -31,7 +31,7 @@ struct WaitingPlace {
 impl VerdictShare {
     /// True if no verdict waits.
     pub(super) fn is_empty(&self) -> bool {
-        self.places.is_empty()
+        self.positions.is_empty()
     }
 
     /// Reduces the new verdicts of a round to each vehicle's share, in which landmarks that wait
@@ -69,7 +69,7 @@ impl VerdictShare {
     pub(super) fn drain(&mut self, verdicts: Vec<Verdict>, vote: &Vote) -> Vec<Verdict> {
         verdicts.into_iter().for_each(|verdict| self.add(verdict));
         std::mem::take(self)
-            .places
+            .positions
             .keys()
             .filter_map(|landmark| vote.verdict(landmark))
             .collect()
@@ -80,9 +80,9 @@ impl VerdictShare {
         let voter = verdict.contributors.into_iter().next();
         let landmark = verdict.landmark;
         if self
-            .places
+            .positions
             .get(&landmark)
-            .is_some_and(|place| place.voter == voter)
+            .is_some_and(|position| position.voter == voter)
         {
             return;
         }
@@ -93,11 +93,12 @@ impl VerdictShare {
             .entry(voter.clone())
             .or_default()
             .insert(number, landmark.clone());
-        self.places.insert(landmark, WaitingPlace { voter, number });
+        self.positions
+            .insert(landmark, QueuePosition { voter, number });
     }
 
     fn remove(&mut self, landmark: &LandmarkId) {
-        let Some(WaitingPlace { voter, number }) = self.places.remove(landmark) else {
+        let Some(QueuePosition { voter, number }) = self.positions.remove(landmark) else {
             return;
         };
         if let Some(landmarks) = self.waiting.get_mut(&voter) {
@@ -116,7 +117,7 @@ fn bytes_of(verdict: &Verdict) -> usize {
         .keys()
         .map(|label| escaped(label) + SCORE_BYTES);
     let names = verdict.contributors.iter().map(|name| name.as_str().len());
-    NUMBERS_BYTES
+    VERDICT_BYTES
         + escaped(&verdict.landmark)
         + verdict.label.as_ref().map_or(0, escaped)
         + scores.sum::<usize>()
