@@ -1,5 +1,7 @@
 //! Logins in texts that are shown, such as errors about addresses.
 
+use std::net::SocketAddr;
+
 /// Placeholder printed instead of a secret.
 pub const HIDDEN: &str = "***";
 
@@ -67,7 +69,10 @@ fn without_bare_logins(text: &str) -> String {
 
 fn without_bare_login(text: &str) -> String {
     let hidden = text.rsplit_once('@').and_then(|(before, host)| {
-        let is_user = |word: &&str| word.trim_end_matches(':').contains(':');
+        let is_user = |word: &&str| {
+            let word = word.trim_end_matches([':', ';', ',', '.', ')']);
+            word.contains(':') && word.parse::<SocketAddr>().is_err()
+        };
         let word = before.split_whitespace().find(is_user)?;
         let (sentence, _) = before.split_once(word)?;
         let (user, _) = word.split_once(':')?;
@@ -124,6 +129,10 @@ mod tests {
             (
                 "to http://[fe80::1]:80/x, 2 tries",
                 "to http://[fe80::1]:80/x, 2 tries",
+            ),
+            (
+                "cannot reach 10.0.0.2:1883: see ecod-node@edge",
+                "cannot reach 10.0.0.2:1883: see ecod-node@edge",
             ),
             ("rtsp://admin:Geh/eim1@camera/1 failed", "rtsp://*** failed"),
             ("rtsp://admin:Geh?eim1@camera/1", "rtsp://***"),

@@ -163,7 +163,8 @@ impl Label {
 
 impl From<SmolStr> for Label {
     fn from(text: SmolStr) -> Self {
-        if text.is_ascii() {
+        // A text that is much too long for a label stays as it is; the composed form could be longer.
+        if text.is_ascii() || text.len() > 16 * MAX_NAME_BYTES {
             return Self(text);
         }
         let form = ComposingNormalizerBorrowed::new_nfkc();

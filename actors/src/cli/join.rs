@@ -388,6 +388,9 @@ fn ip_of(address: &SockaddrStorage) -> Option<IpAddr> {
     v4.or_else(|| address.as_sockaddr_in6().map(|v6| v6.ip().into()))
 }
 
+/// Most addresses in a token: a guest begins to try one every quarter of a second.
+const MAX_ADDRESSES: usize = 16;
+
 /// The addresses of a machine that other machines can use, IPv4 first. Link-local addresses of IPv6
 /// are left out: each machine needs its own number of the interface to reach them.
 fn reachable(ips: impl Iterator<Item = IpAddr>, bound: SocketAddr) -> Vec<SocketAddr> {
@@ -400,6 +403,7 @@ fn reachable(ips: impl Iterator<Item = IpAddr>, bound: SocketAddr) -> Vec<Socket
         .map(|ip| SocketAddr::new(ip, bound.port()))
         .collect();
     found.sort_by_key(SocketAddr::is_ipv6);
+    found.truncate(MAX_ADDRESSES);
     found
 }
 

@@ -118,7 +118,7 @@ async fn revoked_certificate_is_not_renewed() {
     until("gauss reports the reason", || ending(&gauss).is_some()).await;
     assert_eq!(
         ending(&gauss).unwrap(),
-        "this node's certificate ends in 24 days: edge does not renew it: its certificate was revoked"
+        "this node's certificate ends in 24 days: edge does not renew it: “its certificate was revoked”"
     );
     assert!(edge.frames().get(FrameEvent::RenewalRefused) > 0);
     assert_eq!(days_left(&files, "gauss"), 24);
