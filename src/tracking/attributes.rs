@@ -1,12 +1,16 @@
-//! Label, heading and size of an object: what each vehicle states, and the majority of the vehicles.
+//! Label, heading and size of an object: what each vehicle states, and the weighted sum or median.
 //!
-//! Each vehicle counts once, however often it reports, so that one vehicle cannot decide against two
-//! others.
+//! Each vehicle that has detected the object recently counts once, by its confidences, however often
+//! it reports.
+
+use std::cmp::Reverse;
+use std::time::Duration;
 
 use smallvec::SmallVec;
 
 use crate::model::geometry::wrap_angle;
 use crate::model::names::Label;
+use crate::model::time::Timestamp;
 use crate::wire::PerceivedObject;
 
 /// Maximum number of labels; the most likely labels are kept.
@@ -15,11 +19,21 @@ const MAX_LABELS: usize = 8;
 /// Share of earlier readings that remains after a reading.
 const KEPT: f64 = 0.95;
 
-/// Share of a new value in heading and size.
-const SHARE: f64 = 0.3;
+/// Share of a new value in a vehicle's heading: a car turns within a second.
+const HEADING_SHARE: f64 = 0.5;
+
+/// Share of a new value in a vehicle's size.
+const SIZE_SHARE: f64 = 0.3;
 
 /// Number of readings with which a vehicle has half of its weight.
 const HALF_WEIGHT_READINGS: f64 = 2.0;
+
+/// Maximum age of a vehicle's last statement: the object may have turned since, or the vehicle may
+/// have detected it from afar.
+const MAX_AGE: Duration = Duration::from_secs(2);
+
+/// Maximum angle from the median heading of headings that count.
+const NEAR_RAD: f64 = std::f64::consts::FRAC_PI_4;
 
 /// Labels with their weights.
 pub(super) type LabelWeights = SmallVec<[(Label, f64); 1]>;
@@ -31,6 +45,8 @@ pub(super) struct StatedAttributes {
     labels: LabelWeights,
     /// Fading number of readings.
     readings: f64,
+    /// Time of the last statement.
+    stated_at: Timestamp,
     /// Smoothed direction, radians.
     heading_rad: Option<f64>,
     /// Smoothed length and width, metres.
@@ -38,13 +54,21 @@ pub(super) struct StatedAttributes {
 }
 
 impl StatedAttributes {
-    /// Adds a detection; `heading_rad` is its corrected heading, `trust` the trust in the vehicle.
+    /// True if the last statement is recent at `at`.
+    pub(super) fn is_recent(&self, at: Timestamp) -> bool {
+        at.since(self.stated_at) <= MAX_AGE
+    }
+
+    /// Adds a detection at `at`; `heading_rad` is its corrected heading, `trust` the trust in the
+    /// vehicle.
     pub(super) fn record(
         &mut self,
         object: &PerceivedObject,
         heading_rad: Option<f64>,
         trust: f64,
+        at: Timestamp,
     ) {
+        self.stated_at = self.stated_at.max(at);
         self.readings = KEPT * self.readings + 1.0;
         self.labels
             .iter_mut()
@@ -58,11 +82,11 @@ impl StatedAttributes {
         keep_most_likely(&mut self.labels);
         if let Some(new) = heading_rad {
             let old = self.heading_rad.unwrap_or(new);
-            self.heading_rad = Some(wrap_angle(old + SHARE * wrap_angle(new - old)));
+            self.heading_rad = Some(wrap_angle(old + HEADING_SHARE * wrap_angle(new - old)));
         }
         if let Some(new) = object.size_m {
             let old = self.size_m.unwrap_or(new);
-            self.size_m = Some([0, 1].map(|side| old[side] + SHARE * (new[side] - old[side])));
+            self.size_m = Some([0, 1].map(|side| old[side] + SIZE_SHARE * (new[side] - old[side])));
         }
     }
 }
@@ -76,23 +100,34 @@ pub(super) fn labels<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> 
             add(&mut sum, label, weight / readings);
         }
     }
-    keep_most_likely(&mut sum);
     sum
 }
 
-/// The stated heading with the smallest sum of angles to the others: their median on the circle.
+/// Mean of the stated headings that are near their median on the circle, the heading with the smallest
+/// sum of angles to the others; of several, the latest.
 pub(super) fn heading_rad<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Option<f64> {
-    let headings: SmallVec<[f64; 8]> = stated
-        .filter_map(|attributes| attributes.heading_rad)
+    let mut headings: SmallVec<[(Timestamp, f64); 8]> = stated
+        .filter_map(|attributes| Some((attributes.stated_at, attributes.heading_rad?)))
         .collect();
+    headings.sort_by_key(|(stated_at, _)| Reverse(*stated_at));
     let distance = |heading: &f64| -> f64 {
         let others = headings.iter();
-        others.map(|other| wrap_angle(other - heading).abs()).sum()
+        others
+            .map(|(_, other)| wrap_angle(other - heading).abs())
+            .sum()
     };
+    let by_distance = |a: &f64, b: &f64| distance(a).total_cmp(&distance(b));
     let median = headings
         .iter()
-        .min_by(|a, b| distance(a).total_cmp(&distance(b)));
-    median.copied()
+        .map(|(_, heading)| *heading)
+        .min_by(by_distance)?;
+    let angles: SmallVec<[f64; 8]> = headings
+        .iter()
+        .map(|(_, heading)| wrap_angle(heading - median))
+        .filter(|angle| angle.abs() <= NEAR_RAD)
+        .collect();
+    let mean = angles.iter().sum::<f64>() / angles.len() as f64;
+    Some(wrap_angle(median + mean))
 }
 
 /// Median of the stated lengths and of the stated widths; of two, the smaller one.
@@ -115,7 +150,8 @@ pub(super) fn add(labels: &mut LabelWeights, label: &Label, weight: f64) {
     }
 }
 
-fn keep_most_likely(labels: &mut LabelWeights) {
+/// Removes all but the most likely labels.
+pub(super) fn keep_most_likely(labels: &mut LabelWeights) {
     if labels.len() > MAX_LABELS {
         labels.sort_by(|a, b| b.1.total_cmp(&a.1));
         labels.truncate(MAX_LABELS);

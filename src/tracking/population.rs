@@ -46,26 +46,17 @@ impl Births {
     }
 }
 
-/// The time for which the objects of one vehicle stay in the cell.
-#[derive(Debug, Clone)]
+/// The time for which the objects stay whose tracks one vehicle began.
+#[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Population {
     departures: f64,
     /// Seconds for which objects stayed.
     stayed_s: f64,
 }
 
-impl Default for Population {
-    fn default() -> Self {
-        Self {
-            departures: Self::USUAL_TIME_S * Self::USUAL_LEAVING_HZ,
-            stayed_s: Self::USUAL_TIME_S,
-        }
-    }
-}
-
 impl Population {
-    /// Usual rate at which objects leave, per second.
-    pub(super) const USUAL_LEAVING_HZ: f64 = 1.0 / 15.0;
+    /// Usual stay of an object in seconds.
+    const USUAL_STAY_S: f64 = 15.0;
 
     /// Time in seconds as which the usual stay counts.
     const USUAL_TIME_S: f64 = 60.0;
@@ -73,8 +64,39 @@ impl Population {
     /// Time in seconds beyond which earlier stays are discounted.
     const MAX_TIME_S: f64 = 3000.0;
 
-    /// Rate at which objects leave, per second.
-    pub(super) fn leaving_hz(&self) -> f64 {
+    /// Rate at which the objects of all vehicles leave, per second.
+    ///
+    /// The vehicle whose objects leave at the highest rate does not count, unless it is the only one:
+    /// a vehicle may invent objects that come and go, and existences of all vehicles' objects fade at
+    /// this rate.
+    pub(super) fn leaving_hz<'a>(of_vehicles: impl Iterator<Item = &'a Self>) -> f64 {
+        let mut sum = Self::usual();
+        let mut vehicles = 0;
+        let mut highest: Option<Self> = None;
+        for population in of_vehicles.filter(|population| population.stayed_s > 0.0) {
+            vehicles += 1;
+            sum.departures += population.departures;
+            sum.stayed_s += population.stayed_s;
+            let is_highest = highest.is_none_or(|highest| population.rate() > highest.rate());
+            if is_highest {
+                highest = Some(*population);
+            }
+        }
+        if let Some(highest) = highest.filter(|_| vehicles > 1) {
+            sum.departures -= highest.departures;
+            sum.stayed_s -= highest.stayed_s;
+        }
+        sum.rate()
+    }
+
+    fn usual() -> Self {
+        Self {
+            departures: Self::USUAL_TIME_S / Self::USUAL_STAY_S,
+            stayed_s: Self::USUAL_TIME_S,
+        }
+    }
+
+    fn rate(&self) -> f64 {
         self.departures / self.stayed_s
     }
 

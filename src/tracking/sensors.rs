@@ -9,7 +9,6 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
-use super::detection_history::DetectionHistory;
 use super::existence::{DetectionRates, ObservationRates, ObservationState};
 use super::handles::SensorId;
 use super::population::{Births, Population};
@@ -156,16 +155,9 @@ impl Sensors {
         }
     }
 
-    /// Rate at which an object leaves, per second: the lowest rate of the vehicles that have detected
-    /// it, so that the invented objects of one vehicle do not raise the rate for the objects of others.
-    pub(super) fn leaving_hz(&self, history: &DetectionHistory) -> f64 {
-        history
-            .iter()
-            .filter(|history| history.last_hit.is_some())
-            .filter_map(|history| self.get(history.sensor))
-            .map(|sensor| sensor.population.leaving_hz())
-            .min_by(f64::total_cmp)
-            .unwrap_or(Population::USUAL_LEAVING_HZ)
+    /// Rate at which objects leave, per second.
+    pub(super) fn leaving_hz(&self) -> f64 {
+        Population::leaving_hz(self.iter().map(|sensor| &sensor.population))
     }
 
     /// Sets the pose biases of all vehicles to zero.

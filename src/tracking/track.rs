@@ -13,8 +13,7 @@ use super::detection_history::DetectionHistory;
 use super::existence::{Existence, SensorHistory, logistic};
 use super::grid::IndexedTrack;
 use super::handles::{SensorId, TrackIndex};
-use super::kinematics::{KinematicState, Measurement};
-use super::population::Population;
+use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::twins::Twins;
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName};
@@ -26,6 +25,9 @@ const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
 
 /// Share of the weight of labels from another aggregator's map that remains after an instant with a detection.
 const INHERITED_KEPT: f64 = 0.95;
+
+/// Weight below which such a label is dropped.
+const MIN_INHERITED: f64 = 1e-3;
 
 /// Similarity to a label without any reading.
 pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
@@ -78,8 +80,8 @@ pub(super) struct Track {
     pub(super) last_seen: Timestamp,
     /// Existence from all observations.
     pub(super) existence: Existence,
-    /// Rate at which the object leaves, per second.
-    pub(super) leaving_hz: f64,
+    /// True if the velocity is a stated one of the first vehicles that detected the object.
+    pub(super) is_velocity_stated: bool,
     /// True if the last observation of any vehicle was a detection.
     is_detected: bool,
     /// The vehicle whose detection began the track.
@@ -114,7 +116,7 @@ impl Track {
             first_seen: at,
             last_seen: at,
             existence: Existence::new(f64::NEG_INFINITY, at),
-            leaving_hz: Population::USUAL_LEAVING_HZ,
+            is_velocity_stated: false,
             is_detected: true,
             spawned_by: None,
             is_settled: false,
@@ -144,13 +146,22 @@ impl Track {
         at: Timestamp,
     ) {
         if let Some(history) = self.history.for_hit(sensor, at) {
-            history.attributes.record(object, heading_rad, trust);
+            history.attributes.record(object, heading_rad, trust, at);
         }
     }
 
-    /// Derives label, heading and size from the statements of all vehicles.
-    pub(super) fn combine_attributes(&mut self) {
-        let stated = || self.history.iter().map(|history| &history.attributes);
+    /// Updates the velocity by a stated one that has been accepted, m/s.
+    pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>) {
+        self.is_velocity_stated = true;
+        self.state.update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
+    }
+
+    /// Derives label, heading and size from the recent statements of all vehicles.
+    pub(super) fn combine_attributes(&mut self, at: Timestamp) {
+        let stated = || {
+            let statements = self.history.iter().map(|history| &history.attributes);
+            statements.filter(|attributes| attributes.is_recent(at))
+        };
         let mut labels = attributes::labels(stated());
         let heading_rad = attributes::heading_rad(stated());
         let size_m = attributes::size_m(stated());
@@ -158,6 +169,9 @@ impl Track {
             attributes::add(&mut labels, label, *weight);
             *weight *= INHERITED_KEPT;
         }
+        self.inherited_labels
+            .retain(|(_, weight)| *weight >= MIN_INHERITED);
+        attributes::keep_most_likely(&mut labels);
         self.labels = labels;
         self.heading_rad = heading_rad.or(self.heading_rad);
         self.size_m = size_m.or(self.size_m);
@@ -235,10 +249,9 @@ impl Track {
         self.hits >= CONFIRMED_HITS
     }
 
-    /// Predicts the existence to `at`.
-    pub(super) fn predict_existence(&mut self, at: Timestamp) {
-        self.existence
-            .predict(at, self.leaving_hz, self.is_detected);
+    /// Predicts the existence to `at`; `leaving_hz` is the rate at which objects leave.
+    pub(super) fn predict_existence(&mut self, at: Timestamp, leaving_hz: f64) {
+        self.existence.predict(at, leaving_hz, self.is_detected);
     }
 
     /// Records whether any vehicle detects the object at `at`.
@@ -250,9 +263,14 @@ impl Track {
 
     /// Probability that the object is there at `at`, from observations and confidences; `trust` returns the trust in a
     /// vehicle, 0 to 1.
-    pub(super) fn existence_at(&self, at: Timestamp, trust: impl Fn(SensorId) -> f64) -> f64 {
+    pub(super) fn existence_at(
+        &self,
+        at: Timestamp,
+        leaving_hz: f64,
+        trust: impl Fn(SensorId) -> f64,
+    ) -> f64 {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
-        let observations = self.existence.log_odds_at(at, self.leaving_hz, is_detected);
+        let observations = self.existence.log_odds_at(at, leaving_hz, is_detected);
         let mut confidences = 0.0;
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);
@@ -301,13 +319,18 @@ impl Track {
             .filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
-    /// Whether a vehicle other than `sensor` has detected the object.
-    pub(super) fn is_detected_by_others(&self, sensor: SensorId) -> bool {
+    /// Whether a trusted vehicle other than `sensor` has detected the object; `trust` returns the
+    /// trust in a vehicle, 0 to 1.
+    pub(super) fn is_detected_by_others(
+        &self,
+        sensor: SensorId,
+        trust: impl Fn(SensorId) -> f64,
+    ) -> bool {
         let mut others = self
             .history
             .iter()
-            .filter(|history| history.sensor != sensor);
-        others.any(|history| history.last_hit.is_some())
+            .filter(|history| history.sensor != sensor && history.last_hit.is_some());
+        others.any(|history| trust(history.sensor) > 0.0)
     }
 
     /// Whether a vehicle other than `sensor` detected the object shortly before `at`.
@@ -348,6 +371,7 @@ impl Track {
             .iter()
             .map(|(label, score)| (label.clone(), *score))
             .collect();
+        attributes::keep_most_likely(&mut self.labels);
         self.inherited_labels = self.labels.clone();
         self.inherited_heading_rad = object.heading_rad;
         self.size_m = object.size_m;

@@ -5,6 +5,7 @@
 //! every vehicle, updates the sensor models, and spawns tracks from the remaining detections.
 
 use nalgebra::{Matrix2, Vector2};
+use smallvec::SmallVec;
 
 use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
@@ -68,6 +69,8 @@ pub(super) struct InstantUpdate<'a> {
     pub(super) tracks: &'a mut TrackStore,
     pub(super) sensors: &'a mut Sensors,
     pub(super) neighbours: &'a mut NeighbourTracks,
+    /// Rate at which objects leave, per second.
+    pub(super) leaving_hz: f64,
     pub(super) at: Timestamp,
 }
 
@@ -164,7 +167,7 @@ impl InstantUpdate<'_> {
             track.history.clear();
         }
         track.record_hit(at);
-        track.predict_existence(at);
+        track.predict_existence(at, self.leaving_hz);
         track.existence.raise(OWN_NATS);
         if let Some(history) = track.history.for_hit(vehicle, at) {
             history.hit(at, measurement.position, OWN_NATS, OWN_NATS);
@@ -316,17 +319,17 @@ impl InstantUpdate<'_> {
             let Some(velocity) = velocity_stated(self.sensors, scan, detection) else {
                 continue;
             };
-            let is_only_witness = alone && !track.is_detected_by_others(scan.sensor);
+            let fleet = &self.sensors.fleet;
+            let is_only_witness = hits().filter(|(scan, _)| scan.is_trusted()).count() == 1
+                && !track.is_detected_by_others(scan.sensor, |id| fleet.trust(id));
             let is_admitted = if is_only_witness {
                 prior.is_possible(&velocity)
             } else {
-                track.is_confirmed()
+                (track.is_confirmed() || track.is_velocity_stated)
                     && prior.admits_velocity(at, &velocity, VELOCITY_SIGMA_MPS, self.config.gate())
             };
             if is_admitted {
-                track
-                    .state
-                    .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
+                track.update_velocity(at, velocity);
             }
         }
         track.record_hit_by(hits().map(|(scan, _)| scan.sensor), at);
@@ -360,8 +363,7 @@ impl InstantUpdate<'_> {
             let heading_rad = heading_stated(self.sensors, scan, detection);
             track.record_attributes(scan.sensor, detection.object, heading_rad, scan.trust, at);
         }
-        track.combine_attributes();
-        track.leaving_hz = self.sensors.leaving_hz(&track.history);
+        track.combine_attributes(at);
         if track.vehicle.is_none() {
             track.state.class = ObjectClass::of(&track.label(self.config), self.config);
         }
@@ -381,7 +383,7 @@ impl InstantUpdate<'_> {
         for (number, observation) in observations.iter().enumerate() {
             let scan = &scans[observation.scan];
             let track = &mut self.tracks[observation.track];
-            track.predict_existence(at);
+            track.predict_existence(at, self.leaving_hz);
             let nats = observation.rates.nats(observation.detection.is_some());
             if observation.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
@@ -652,15 +654,18 @@ impl InstantUpdate<'_> {
                 }
             }
         }
-        track.combine_attributes();
-        track.leaving_hz = self.sensors.leaving_hz(&track.history);
-        let velocity = velocity_stated(self.sensors, first, detection);
-        if let Some(velocity) = velocity.filter(|_| hits().nth(1).is_none())
-            && track.state.is_possible(&velocity)
-        {
-            track
-                .state
-                .update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
+        track.combine_attributes(at);
+        let velocities: SmallVec<[Vector2<f64>; 4]> = hits()
+            .filter_map(|(scan, detection)| velocity_stated(self.sensors, scan, detection))
+            .filter(|velocity| track.state.is_possible(velocity))
+            .collect();
+        let max_squared = 2.0 * VELOCITY_SIGMA_MPS.powi(2) * self.config.gate();
+        let agree = |other: &Vector2<f64>| (other - velocities[0]).norm_squared() <= max_squared;
+        let is_only_witness = hits().nth(1).is_none();
+        if is_only_witness || velocities.len() > 1 && velocities.iter().all(agree) {
+            for velocity in &velocities {
+                track.update_velocity(at, *velocity);
+            }
         }
         track.record_hit(at);
         let trust = hits().map(|(scan, _)| scan.trust).fold(0.0, f64::max);
