@@ -393,9 +393,9 @@ impl Aggregator {
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// The remaining verdicts as a separate round, at the end of a recording: those that wait for
-    /// their vehicle's share, and those of the incomplete packet of VOTE's `paper` mode. `None` if
-    /// there are neither, or without leadership.
+    /// The remaining verdicts as a separate round, at the end of a recording: verdicts that wait for
+    /// their vehicle's share, and verdicts of the incomplete packet of VOTE's `paper` mode. `None`
+    /// without such verdicts or without leadership.
     pub fn end_recording(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let vote = self.vote.as_mut()?;

@@ -14,7 +14,7 @@ const VERDICT_BYTES: usize = 110;
 /// Landmarks whose verdicts wait, at most one entry of each.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VerdictShare {
-    /// By the only voter, or `None` if there is none any more; those that wait longest first.
+    /// By the only voter, or `None` if the voter has left; the longest waiting landmarks first.
     waiting: BTreeMap<Option<NodeName>, BTreeMap<u64, LandmarkId>>,
     positions: BTreeMap<LandmarkId, QueuePosition>,
     /// Number of the next entry.

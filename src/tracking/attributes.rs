@@ -59,8 +59,8 @@ impl StatedAttributes {
         at.since(self.stated_at) <= MAX_AGE
     }
 
-    /// Adds a detection at `at`; `heading_rad` is its corrected heading, `trust` the trust in the
-    /// vehicle.
+    /// Adds a detection at `at`; `heading_rad` is its corrected heading, `trust` the vehicle's weight,
+    /// 0 to 1.
     pub(super) fn record(
         &mut self,
         object: &PerceivedObject,

@@ -80,7 +80,7 @@ pub(super) struct Track {
     pub(super) last_seen: Timestamp,
     /// Existence from all observations.
     pub(super) existence: Existence,
-    /// True if the velocity is a stated one of the first vehicles that detected the object.
+    /// True if a vehicle that detected the object early has stated its velocity.
     pub(super) is_velocity_stated: bool,
     /// True if the last observation of any vehicle was a detection.
     is_detected: bool,
@@ -150,7 +150,7 @@ impl Track {
         }
     }
 
-    /// Updates the velocity by a stated one that has been accepted, m/s.
+    /// Updates the velocity by an accepted statement, m/s.
     pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>) {
         self.is_velocity_stated = true;
         self.state.update_velocity(at, velocity, VELOCITY_SIGMA_MPS);
@@ -319,8 +319,8 @@ impl Track {
             .filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
-    /// Whether a trusted vehicle other than `sensor` has detected the object; `trust` returns the
-    /// trust in a vehicle, 0 to 1.
+    /// Whether a vehicle other than `sensor` has detected the object; `trust` returns a vehicle's
+    /// weight, 0 to 1, and vehicles of weight 0 do not count.
     pub(super) fn is_detected_by_others(
         &self,
         sensor: SensorId,

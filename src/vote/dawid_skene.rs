@@ -340,9 +340,9 @@ impl DawidSkene {
         }
     }
 
-    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote is not evidence:
-    /// neither about its vehicle, nor about the shares of the classes, because a vehicle could
-    /// invent any number of landmarks.
+    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote changes
+    /// the evidence about its vehicle and the shares of the classes as little as a missing vote,
+    /// because a vehicle could invent any number of landmarks.
     pub(super) fn add_live(
         &mut self,
         votes: &[WeightedVote],

@@ -18,8 +18,8 @@ use crate::telemetry::counters::Counters;
 /// Maximum subscriptions of one client, and of all clients of one certificate or address.
 pub(super) const MAX_SUBSCRIPTIONS: usize = 256;
 
-/// Maximum number of a client's filters with wildcards that overlap one of them. The broker sends a
-/// client each message once per matching filter, so this limits the copies of one message.
+/// Maximum number of a client's filters with wildcards that overlap the same filter. The broker sends
+/// a client each message once per matching filter, so this limits the copies of one message.
 const MAX_OVERLAPS: usize = 8;
 
 /// Time after which one more subscription is allowed once a burst is used up.
