@@ -345,6 +345,31 @@ fn eastward_heading_averages_correctly() {
     }
 }
 
+/// Two vehicles that have left stated another heading of a car that has turned since.
+#[test]
+fn old_heading_does_not_count() {
+    let turned = |heading_rad| PerceivedObject {
+        heading_rad: Some(heading_rad),
+        ..car(0.0, 0.0)
+    };
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..60 {
+        if frame < 20 {
+            for node in ["euclid", "riemann"] {
+                let seen = vec![turned(0.0)];
+                tracker.observe(report(node, frame, seen), at(frame));
+            }
+        } else {
+            let seen = vec![turned(1.5)];
+            tracker.observe(report("gauss", frame, seen), at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let heading_rad = round.objects[0].heading_rad.unwrap();
+    assert!((heading_rad - 1.5).abs() < 0.1, "{heading_rad}");
+}
+
 #[test]
 fn late_report_counts_within_bound() {
     for frame_m in [1.5, 2.8] {
