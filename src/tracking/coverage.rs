@@ -45,7 +45,7 @@ impl Coverage {
     const DIRECTIONS: usize = 24;
 
     /// Maximum range, metres.
-    pub(super) const MAX_RANGE_M: f64 = 160.0;
+    const MAX_RANGE_M: f64 = 160.0;
 
     /// Distance in metres that is too large for any vehicle between two reports.
     const JUMP_M: f64 = 500.0;

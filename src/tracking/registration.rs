@@ -7,7 +7,6 @@ use std::time::Duration;
 use nalgebra::Vector2;
 
 use super::config::TracksConfig;
-use super::coverage::Coverage;
 use super::gauge::Gauge;
 use super::handles::{SensorId, TrackIndex};
 use super::pose_bias::Correspondence;
@@ -94,11 +93,7 @@ impl Correspondence {
             };
             let passed_us = frame.at.micros_from(hit);
             let trust = sensors.fleet.trust(other.sensor);
-            let origin = theirs.coverage.position();
-            let is_in_range = origin
-                .is_none_or(|origin| (other.position - origin).norm() <= Coverage::MAX_RANGE_M);
-            let is_simultaneous = passed_us.unsigned_abs() <= SIMULTANEOUS.as_micros() as u64;
-            if !is_simultaneous || !is_in_range || trust <= 0.0 {
+            if passed_us.unsigned_abs() > SIMULTANEOUS.as_micros() as u64 || trust <= 0.0 {
                 continue;
             }
             sum += (other.position + velocity * (passed_us as f64 * 1e-6)) * trust;

@@ -157,28 +157,3 @@ fn invented_crowd_leaves_room() {
         "{round:?}"
     );
 }
-
-/// Two cameras see the same parked cars half a metre apart, and a third states a pose far from its objects.
-#[test]
-fn remote_pose_leaves_alignment() {
-    let mut tracker = tracker();
-    let mut round = TracksRound::default();
-    let cars = |x_m: f64| {
-        (0..12)
-            .map(|n| car(x_m + 12.0 * f64::from(n % 4), 14.0 * f64::from(n / 4)))
-            .collect::<Vec<_>>()
-    };
-    for frame in 0..100 {
-        tracker.observe(report("euclid", frame, cars(0.0)), at(frame));
-        tracker.observe(report("gauss", frame, cars(0.5)), at(frame));
-        let forged = ObjectReport {
-            pose: Some(WirePose::new(1e8, 0.0, 0.0)),
-            moving: Some(false),
-            ..report("mallory", frame, cars(0.25))
-        };
-        tracker.observe(forged, at(frame));
-        round = tracker.close(at(frame));
-    }
-    let [a, b] = ["euclid", "gauss"].map(|node| round.pose_corrections[&name(node)]);
-    assert!((a.dx_m - b.dx_m - 0.5).abs() < 0.15, "{a:?} {b:?}");
-}
