@@ -607,7 +607,7 @@ mod tests {
         }
     }
 
-    /// Vehicles whose reports come up to 11 times a second, also at jittered times, get them fused at once.
+    /// Reports that come up to 11 times a second, also at jittered times, are fused at once.
     #[test]
     fn jittered_reports_are_not_delayed() {
         for jitter_ms in [[0, 0, 0, 0], [9, 0, 5, 1], [0, 10, 0, 10]] {

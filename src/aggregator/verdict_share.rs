@@ -21,7 +21,7 @@ pub(super) struct VerdictShare {
     next: u64,
 }
 
-/// The position of a landmark among those that wait.
+/// The position of a waiting landmark in its voter's queue.
 #[derive(Debug, Clone)]
 struct QueuePosition {
     voter: Option<NodeName>,
@@ -75,7 +75,7 @@ impl VerdictShare {
             .collect()
     }
 
-    /// Adds a landmark behind the others of its voter; a landmark that waits keeps its place.
+    /// Adds a landmark behind the others of its voter; a waiting landmark keeps its position.
     fn add(&mut self, verdict: Verdict) {
         let voter = verdict.contributors.into_iter().next();
         let landmark = verdict.landmark;
