@@ -315,7 +315,7 @@ impl DoorState {
             let filters = lock(&self.filters);
             filters
                 .keys()
-                .any(|(_, filter)| matches(TopicPlace::of(filter).1, topic))
+                .any(|(_, filter)| rumqttc::matches(topic, TopicPlace::of(filter).1))
         };
         if is_of_others || is_read() {
             return Ok(());
@@ -554,20 +554,6 @@ impl DoorState {
             levels.next().is_none_or(|level| level == "#")
         })
     }
-}
-
-/// True if a filter matches a topic (MQTT 5, section 4.7).
-fn matches(filter: &str, topic: &str) -> bool {
-    let mut levels = topic.split('/');
-    for wanted in filter.split('/') {
-        match (wanted, levels.next()) {
-            ("#", _) => return true,
-            ("+", Some(_)) => {}
-            (wanted, Some(level)) if wanted == level => {}
-            _ => return false,
-        }
-    }
-    levels.next().is_none()
 }
 
 /// True if a program's message on the topic of a node's status requests to dismiss the node: it is
