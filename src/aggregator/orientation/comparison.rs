@@ -88,8 +88,6 @@ struct ComparedReport {
     gate_m: f64,
     /// Number of objects that nearly coincide as reported.
     agreeing: usize,
-    /// Distance in metres of the only other vehicle; `None` beside several, or without poses.
-    lone_witness_m: Option<f64>,
 }
 
 /// An object of another observer.
@@ -185,17 +183,12 @@ impl WindowComparison {
         2 * spread.count() > self.snapshots.len()
     }
 
-    /// True if in most reports the explained objects are objects of two other vehicles. One vehicle
-    /// against another shows only that they differ: a change about a point that both share would
-    /// explain the right one, too. Changes about the observer's own position need only one other
-    /// vehicle, if that stands elsewhere.
+    /// True if most reports are witnessed.
     fn is_witnessed(&self, misreading: &Misreading) -> bool {
-        let witnessed = self.snapshots.iter().filter(|snapshot| {
-            let stands_elsewhere = snapshot
-                .lone_witness_m
-                .is_some_and(|distance_m| distance_m >= MIN_APART_GATES * snapshot.gate_m);
-            snapshot.witnesses(misreading) >= 2 || stands_elsewhere && !misreading.is_of_frame()
-        });
+        let witnessed = self
+            .snapshots
+            .iter()
+            .filter(|snapshot| snapshot.is_witnessed(misreading));
         2 * witnessed.count() > self.snapshots.len()
     }
 
@@ -259,15 +252,6 @@ impl ComparedReport {
                 others.any(|other| is_near(object, &other.objects, PRESENT_GATES * gate_m))
             })
             .count();
-        let nearest = others.first();
-        let lone_witness = nearest.filter(|nearest| {
-            let mut others = others.iter();
-            others.all(|other| other.witness == nearest.witness)
-        });
-        let lone_witness_m = lone_witness.and_then(|other| {
-            let distance_m = nalgebra::distance(&own.pose?.position, &other.pose?.position);
-            Some(distance_m)
-        });
         let references = if agreeing as f64 > CERTAINLY_AGREEING * objects.len() as f64 {
             Vec::new()
         } else {
@@ -279,27 +263,43 @@ impl ComparedReport {
             references,
             gate_m,
             agreeing,
-            lone_witness_m,
         })
     }
 
-    /// Number of other vehicles of which some objects coincide with the explained ones.
-    fn witnesses(&self, misreading: &Misreading) -> usize {
+    /// True if the explained objects are objects of two other vehicles. One vehicle against another
+    /// shows only that they differ: a change about a point that both share would explain the right
+    /// one, too. A change about the observer's own position needs only one other vehicle, if that
+    /// stands elsewhere and no further vehicle reports objects there.
+    fn is_witnessed(&self, misreading: &Misreading) -> bool {
         let images: Vec<_> = self.coinciding(misreading, None).collect();
-        let mut objects = [0; u32::BITS as usize];
+        let centre = mean(&images);
+        let around_m = 2.0 * root_mean_square_m(&images);
+        let mut coinciding = [0; u32::BITS as usize];
+        let mut around = 0;
+        let mut only: Option<Pose> = None;
         for reference in &self.references {
-            let change = misreading.change_of_other(reference.observer.as_ref());
-            let coincides = change.is_some_and(|change| {
-                is_near(&change.apply(&reference.position), &images, self.gate_m)
-            });
-            for (number, objects) in objects.iter_mut().enumerate() {
+            let Some(change) = misreading.change_of_other(reference.observer.as_ref()) else {
+                continue;
+            };
+            let position = change.apply(&reference.position);
+            if nalgebra::distance(&position, &centre) > around_m {
+                continue;
+            }
+            around |= reference.witnesses;
+            only = only.or(reference.observer);
+            let coincides = is_near(&position, &images, self.gate_m);
+            for (number, objects) in coinciding.iter_mut().enumerate() {
                 *objects += u32::from(coincides) & reference.witnesses >> number;
             }
         }
-        objects
-            .into_iter()
-            .filter(|objects| *objects >= MIN_OF_WITNESS)
-            .count()
+        let witnesses = coinciding
+            .iter()
+            .filter(|objects| **objects >= MIN_OF_WITNESS)
+            .count();
+        let stands_elsewhere = only.zip(self.pose).is_some_and(|(only, own)| {
+            nalgebra::distance(&only.position, &own.position) >= MIN_APART_GATES * self.gate_m
+        });
+        witnesses >= 2 || !misreading.is_of_frame() && around.count_ones() == 1 && stands_elsewhere
     }
 
     /// Images of the objects that coincide after the change and a shift in gates.

@@ -296,6 +296,22 @@ fn two_cameras_name_only_turned_one() {
     assert_eq!(found_at_crossing(&[euclid, exchanged], 1), BTreeMap::new());
 }
 
+/// A camera in another street has no objects that could confirm or contradict the turn.
+#[test]
+fn unrelated_camera_hinders_no_naming() {
+    let [euclid, _, watson] = corners();
+    let turned = watson.with(Mistake::HeadingOff(FRAC_PI_2));
+    let elsewhere = Camera::new("noether", 320.0, 300.0, FRAC_PI_4);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let bodies = crossing(&mut rng);
+    let found = found(&[euclid, turned, elsewhere], 120, &mut rng, |seconds| {
+        let here = places(&bodies, seconds);
+        let there = here.iter().map(|place| place + Vector2::new(330.0, 310.0));
+        here.iter().copied().chain(there).collect()
+    });
+    assert_eq!(found.keys().collect::<Vec<_>>(), [&"watson"], "{found:?}");
+}
+
 /// Sixteen parts of a vehicle repeat the objects of a right camera, turned about its position.
 #[test]
 fn parts_are_one_witness() {
