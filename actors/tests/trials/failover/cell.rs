@@ -1,6 +1,6 @@
 //! A cell of real processes, one edge and its vehicles, and the faults that a trial causes.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use tempfile::TempDir;
 use crate::failover::analysis::{Accepted, NodeRun};
 use crate::failover::doors;
 use crate::failover::flood::{Flood, FloodCost};
-use crate::failover::logs;
+use crate::failover::logs::{self, LoggedTrouble};
 use crate::failover::settings::{Addresses, DETECTIONS, addresses, configuration, frame};
 use crate::network::{self, Bridged};
 use crate::ports::Ports;
@@ -342,12 +342,15 @@ impl Cell {
 
     /// The leader's packets do not reach the last vehicle that may lead, or do again. The standby's broker relays the maps.
     pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
-        let nodes = self.nodes.len();
-        let last = (0..nodes)
-            .rfind(|index| !is_cav(nodes, *index))
-            .context("the cell has no nodes")?;
+        let last = self.last_candidate().context("the cell has no nodes")?;
         self.unreached = cut.then_some(last);
         self.bridged()?.cut_one_way(EDGE, last, cut)
+    }
+
+    /// The last vehicle that may lead.
+    pub(crate) fn last_candidate(&self) -> Option<usize> {
+        let nodes = self.nodes.len();
+        (0..nodes).rfind(|index| !is_cav(nodes, *index))
     }
 
     /// Gives a node another address.
@@ -459,6 +462,20 @@ impl Cell {
             })
         };
         runs.map(read).collect()
+    }
+
+    /// The troubles in the logs of all nodes, by node.
+    pub(crate) fn troubles(&self) -> anyhow::Result<BTreeMap<NodeName, Vec<LoggedTrouble>>> {
+        let read = |node: &Node| Ok((node.name.clone(), logs::troubles(&node.log())?));
+        self.nodes.iter().map(read).collect()
+    }
+
+    /// Names of nodes.
+    pub(crate) fn names(&self, nodes: &[usize]) -> BTreeSet<NodeName> {
+        nodes
+            .iter()
+            .filter_map(|node| Some(self.nodes.get(*node)?.name.clone()))
+            .collect()
     }
 
     /// Keeps configurations and logs, and prints their directory.

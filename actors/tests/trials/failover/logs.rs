@@ -5,6 +5,7 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use anyhow::Context;
+use chrono::DateTime;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -109,6 +110,46 @@ pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
     Ok(name.and_then(|name| NodeName::new(name).ok()))
 }
 
+/// A trouble, as a node's log names it when it begins.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct LoggedTrouble {
+    pub(crate) at: Timestamp,
+    pub(crate) kind: String,
+    /// What the trouble is about; `None` for the node itself.
+    pub(crate) about: Option<String>,
+    pub(crate) cause: String,
+}
+
+/// The troubles in a node's log.
+pub(crate) fn troubles(log: &Path) -> anyhow::Result<Vec<LoggedTrouble>> {
+    let text = whole_lines(log)?;
+    let lines = text
+        .lines()
+        .filter_map(|line| Some((line, line.split_once("ecod_actors::telemetry::troubles: ")?)));
+    lines
+        .map(|(line, (head, trouble))| {
+            logged_trouble(head, trouble).with_context(|| format!("no trouble: {line}"))
+        })
+        .collect()
+}
+
+/// A trouble from the parts of its line before and after the name of the module.
+fn logged_trouble(head: &str, trouble: &str) -> Option<LoggedTrouble> {
+    let time = DateTime::parse_from_rfc3339(head.split_whitespace().next()?).ok()?;
+    let (cause, fields) = trouble.split_once(" kind=\"")?;
+    let (kind, rest) = fields.split_once('"')?;
+    let about = rest
+        .strip_prefix(" about=\"")
+        .and_then(|rest| rest.split_once('"'))
+        .map(|(about, _)| about.to_owned());
+    Some(LoggedTrouble {
+        at: Timestamp(u64::try_from(time.timestamp_micros()).ok()?),
+        kind: kind.to_owned(),
+        about,
+        cause: cause.to_owned(),
+    })
+}
+
 fn parse(line: &str) -> anyhow::Result<Accepted> {
     let Line {
         received_at_us,
@@ -199,6 +240,29 @@ mod tests {
         assert!(accepted(missing).unwrap().is_empty());
         assert_eq!(last_accepted(missing).unwrap(), None);
         assert_eq!(last_accepted(file("{\"received").path()).unwrap(), None);
+    }
+
+    #[test]
+    fn troubles_are_read() {
+        let lines = concat!(
+            "2026-11-30T23:49:22.658009Z  WARN ecod_actors::telemetry::troubles: gone for 10 s kind=\"node_missing\" ",
+            "about=\"v02\" remedy=\"start it again\"\n",
+            "2026-11-30T23:49:23.000001Z  INFO ecod_actors::node: follows\n",
+            "2026-11-30T23:49:24.000001Z  WARN ecod_actors::telemetry::troubles: a full disk kind=\"not_recorded\" remedy=\"-\"\n",
+        );
+        let found = troubles(file(lines).path()).unwrap();
+        let words: Vec<_> = found
+            .iter()
+            .map(|it| [&*it.kind, it.about.as_deref().unwrap_or("-"), &*it.cause])
+            .collect();
+        assert_eq!(
+            words,
+            [
+                ["node_missing", "v02", "gone for 10 s"],
+                ["not_recorded", "-", "a full disk"]
+            ]
+        );
+        assert_eq!(found[0].at, Timestamp(1_796_082_562_658_009));
     }
 
     #[test]

@@ -1,9 +1,10 @@
 //! All faults together, for any time: each minute causes a fault from the seed, the cell must work again before the
-//! minute ends, and memory and files must not grow.
+//! minute ends, the nodes show no trouble that does not follow from it, and memory and files must not grow.
 //!
 //! `make soak` runs it: `MINUTES=n` (default 30), `NODES=n` (default 32) and `SEED=n` (default 1). The summary is printed
 //! and written to `target/soak.json`; the files of a soak that went wrong are kept.
 
+mod alarms;
 mod disturbance;
 mod growth;
 mod intruder;
@@ -12,6 +13,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod_actors::platform::clock;
 use rand::SeedableRng;
@@ -23,6 +25,7 @@ use crate::failover::analysis::{Accepted, NodeRun, longest_wait, stale};
 use crate::failover::cell::{Cell, Plan};
 use crate::failover::{end_with_the_harness, target_file};
 use crate::network;
+use alarms::Alarm;
 use disturbance::Disturbance;
 use growth::{Resources, Series};
 use intruder::Intruder;
@@ -54,12 +57,15 @@ struct Summary {
     watched_for_growth: usize,
     growing: Vec<String>,
     largest: Resources,
+    alarms: Vec<Alarm>,
 }
 
 /// One minute of it.
 #[derive(Debug, Clone, Serialize)]
 struct Minute {
-    disturbance: String,
+    disturbance: Disturbance,
+    #[serde(skip)]
+    struck: BTreeSet<NodeName>,
     /// Longest time that a vehicle that ran throughout waited for a map.
     longest_gap_ms: u64,
     /// Time from the end of the disturbance until all followed one leader again; `None` if they did not.
@@ -123,7 +129,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         let began = Instant::now();
         let from = clock::now();
         let disturbance = Disturbance::draw(&mut rng, bridged);
-        disturbance.carry_out(cell, &mut intruder, &mut rng).await?;
+        let struck = disturbance.carry_out(cell, &mut intruder, &mut rng).await?;
         let over = Instant::now();
         let limit = MINUTE.saturating_sub(began.elapsed());
         let recovered = cell.settle_within(limit).await;
@@ -139,7 +145,8 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
             series.entry(process).or_default().push(resources);
         }
         let minute = Minute {
-            disturbance: disturbance.to_string(),
+            disturbance,
+            struck,
             longest_gap_ms: 0,
             recovered_after_ms,
             leader: cell.leader_name()?,
@@ -162,6 +169,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     let growing = series
         .iter()
         .filter_map(|(process, series)| Some(format!("{process}: {}", series.growth()?)));
+    let alarms = alarms::judge(&cell.troubles()?, &past);
     let accepted = || runs.iter().flat_map(|run| &run.accepted);
     Ok(Summary {
         nodes: cell.nodes(),
@@ -186,6 +194,7 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
             .map(|minute| minute.largest)
             .fold(Resources::default(), Resources::max),
         minutes: past,
+        alarms,
     })
 }
 
@@ -235,7 +244,7 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         let well = minute
             .recovered_after_ms
             .map_or_else(|| "never".to_owned(), |ms| format!("{ms} ms"));
-        let what = &minute.disturbance;
+        let what = minute.disturbance.to_string();
         let gap = minute.longest_gap_ms;
         println!(
             "{:>6}  {what:<44}{gap:>10}{well:>12}  {:<8}{}",
@@ -243,6 +252,13 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
             minute.leader,
             minute.largest
         );
+    }
+    println!("\n{:<44}{:<18}{:>5}  verdict", "fault", "trouble", "times");
+    for alarm in &summary.alarms {
+        println!("{alarm}");
+    }
+    for fault in alarms::silent(&summary.minutes, &summary.alarms) {
+        println!("{fault:<44}none");
     }
     println!(
         "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} forged, {} older than 1 s (the oldest {} ms); \
@@ -269,6 +285,14 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         count("forged maps taken", summary.forged_accepted),
         count("maps older than 1 s taken", summary.accepted_older_than_1_s),
         count("minutes unrecovered", summary.unrecovered_minutes),
+        count(
+            "kinds of false alarms",
+            summary
+                .alarms
+                .iter()
+                .filter(|alarm| !alarm.is_right)
+                .count(),
+        ),
     ];
     Ok(counted
         .into_iter()

@@ -1,14 +1,18 @@
 //! What goes wrong in a minute.
 
+use std::collections::BTreeSet;
 use std::fmt::{self, Display, Formatter};
 use std::time::Duration;
 
+use ecod::model::names::NodeName;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
+use serde::{Serialize, Serializer};
 use tokio::time::sleep;
 
 use crate::failover::cell::{Cell, EDGE};
-use crate::failover::soak::intruder::Intruder;
+use crate::failover::logs::LoggedTrouble;
+use crate::failover::soak::intruder::{self, Intruder};
 
 /// Fewest nodes with which every disturbance leaves a cell.
 pub(super) const LEAST_NODES: usize = 5;
@@ -65,55 +69,97 @@ impl Disturbance {
         }
     }
 
-    /// Does it, waits, and undoes it.
+    /// Does it, waits, and undoes it. Returns the nodes that it struck.
     pub(super) async fn carry_out(
         self,
         cell: &mut Cell,
         intruder: &mut Intruder,
         rng: &mut ChaCha8Rng,
-    ) -> anyhow::Result<()> {
+    ) -> anyhow::Result<BTreeSet<NodeName>> {
         let lasts = Duration::from_secs(self.seconds);
+        let mut struck = Vec::new();
         match self.kind {
-            Kind::KillEdge => kill(cell, &[EDGE], lasts).await,
+            Kind::KillEdge => {
+                struck.push(EDGE);
+                kill(cell, &struck, lasts).await?;
+            }
             Kind::KillLeaderAndStandby => {
-                let victims: Vec<_> = [cell.leader()?]
-                    .into_iter()
-                    .chain(cell.standby().ok())
-                    .collect();
-                kill(cell, &victims, lasts).await
+                struck.push(cell.leader()?);
+                struck.extend(cell.standby());
+                kill(cell, &struck, lasts).await?;
             }
             Kind::KillVehicles => {
                 // The later half lives throughout, so that growth would show.
                 let first = rng.random_range(1..cell.nodes() / 2);
-                kill(cell, &[first, first + 1], lasts).await
+                struck.extend([first, first + 1]);
+                kill(cell, &struck, lasts).await?;
             }
             Kind::PauseEdge => {
+                struck.push(EDGE);
                 cell.pause(EDGE, true)?;
                 sleep(lasts).await;
-                cell.pause(EDGE, false)
+                cell.pause(EDGE, false)?;
             }
             Kind::Busy => {
                 cell.busy(BUSY_LOOPS)?;
                 sleep(lasts).await;
-                cell.busy(0)
+                cell.busy(0)?;
             }
-            Kind::Flood => intruder.flood(lasts).await,
-            Kind::BadInput => intruder.send_junk(lasts).await,
+            Kind::Flood => intruder.flood(lasts).await?,
+            Kind::BadInput => intruder.send_junk(lasts).await?,
             Kind::Split => {
+                struck.extend(0..cell.nodes());
                 cell.split(true)?;
                 sleep(lasts).await;
-                cell.split(false)
+                cell.split(false)?;
             }
             Kind::OneWay => {
+                struck.push(EDGE);
+                struck.extend(cell.last_candidate());
                 cell.cut_one_way(true)?;
                 sleep(lasts).await;
-                cell.cut_one_way(false)
+                cell.cut_one_way(false)?;
             }
             Kind::Loss => {
                 cell.lose(LOSS_PERCENT)?;
                 sleep(lasts).await;
-                cell.lose(0)
+                cell.lose(0)?;
             }
+        }
+        Ok(cell.names(&struck))
+    }
+
+    /// True if a trouble follows from the fault, which struck these nodes.
+    pub(super) fn explains(self, trouble: &LoggedTrouble, struck: &BTreeSet<NodeName>) -> bool {
+        let about = trouble.about.as_deref();
+        let is_struck = struck.iter().any(|node| Some(node.as_str()) == about);
+        let is_intruder = about == Some(intruder::NAME);
+        match self.kind {
+            Kind::KillEdge
+            | Kind::KillLeaderAndStandby
+            | Kind::KillVehicles
+            | Kind::PauseEdge
+            | Kind::Split
+            | Kind::OneWay => trouble.kind == "node_missing" && is_struck,
+            Kind::Flood => trouble.kind == "overload" && is_intruder,
+            Kind::BadInput => false,
+            Kind::Busy | Kind::Loss => false,
+        }
+    }
+
+    /// The fault without its length.
+    pub(super) fn cause(self) -> &'static str {
+        match self.kind {
+            Kind::KillEdge => "the edge is killed",
+            Kind::KillLeaderAndStandby => "leader and standby are killed",
+            Kind::KillVehicles => "two vehicles are killed",
+            Kind::PauseEdge => "the edge is stopped",
+            Kind::Busy => "four busy loops",
+            Kind::Flood => "5000 reports/s from one vehicle",
+            Kind::BadInput => "junk to brokers and membership",
+            Kind::Split => "the network is split",
+            Kind::OneWay => "one vehicle receives no message of the edge",
+            Kind::Loss => "a fifth of all packets is lost",
         }
     }
 }
@@ -125,20 +171,14 @@ async fn kill(cell: &mut Cell, victims: &[usize], lasts: Duration) -> anyhow::Re
     victims.iter().try_for_each(|victim| cell.restart(*victim))
 }
 
+impl Serialize for Disturbance {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
 impl Display for Disturbance {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let what = match self.kind {
-            Kind::KillEdge => "the edge is killed",
-            Kind::KillLeaderAndStandby => "leader and standby are killed",
-            Kind::KillVehicles => "two vehicles are killed",
-            Kind::PauseEdge => "the edge is stopped",
-            Kind::Busy => "four busy loops",
-            Kind::Flood => "5000 reports/s from one vehicle",
-            Kind::BadInput => "junk to brokers and membership",
-            Kind::Split => "the network is split",
-            Kind::OneWay => "one vehicle receives no message of the edge",
-            Kind::Loss => "a fifth of all packets is lost",
-        };
-        write!(f, "{what}, {} s", self.seconds)
+        write!(f, "{}, {} s", self.cause(), self.seconds)
     }
 }

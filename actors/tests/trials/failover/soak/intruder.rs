@@ -18,7 +18,7 @@ use tokio::time::{Instant, interval, timeout};
 use crate::failover::settings::CELL;
 
 /// The name it goes by.
-const NAME: &str = "mallory";
+pub(super) const NAME: &str = "mallory";
 
 /// Time between two bursts of reports, and their size: 5000 a second.
 const FLOOD_TICK: Duration = Duration::from_millis(10);
