@@ -55,6 +55,19 @@ const KINDS: [Kind; 10] = [
 const BUSY_LOOPS: usize = 4;
 const LOSS_PERCENT: u8 = 20;
 
+/// Troubles that a flood of a stranger's reports causes: they come from a foreign name, wait in queues, and their objects
+/// are at no landmark.
+const FLOOD_TROUBLES: [&str; 5] = [
+    "overload",
+    "not_permitted",
+    "untimely",
+    "clock_off",
+    "misplaced",
+];
+
+/// Troubles that junk causes.
+const JUNK_TROUBLES: [&str; 3] = ["malformed", "message_refused", "not_permitted"];
+
 impl Disturbance {
     /// Any, as likely as every other.
     pub(super) fn draw(rng: &mut ChaCha8Rng, bridged: bool) -> Self {
@@ -133,7 +146,9 @@ impl Disturbance {
     pub(super) fn explains(self, trouble: &LoggedTrouble, struck: &BTreeSet<NodeName>) -> bool {
         let about = trouble.about.as_deref();
         let is_struck = struck.iter().any(|node| Some(node.as_str()) == about);
-        let is_intruder = about == Some(intruder::NAME);
+        let is_intruder =
+            about.is_some_and(|about| about == intruder::NAME || about.ends_with(", programs"));
+        let is_one_of = |kinds: &[&str]| kinds.contains(&&*trouble.kind);
         match self.kind {
             Kind::KillEdge
             | Kind::KillLeaderAndStandby
@@ -141,8 +156,8 @@ impl Disturbance {
             | Kind::PauseEdge
             | Kind::Split
             | Kind::OneWay => trouble.kind == "node_missing" && is_struck,
-            Kind::Flood => trouble.kind == "overload" && is_intruder,
-            Kind::BadInput => false,
+            Kind::Flood => is_intruder && is_one_of(&FLOOD_TROUBLES),
+            Kind::BadInput => is_intruder && is_one_of(&JUNK_TROUBLES),
             Kind::Busy | Kind::Loss => false,
         }
     }
