@@ -168,13 +168,17 @@ fn witnesses(reports: Vec<&ObjectReport>) -> Vec<PlacedReport> {
     for report in reports {
         let vehicle = report.node.vehicle();
         let known = vehicles.iter().position(|(name, _)| *name == vehicle);
-        let number = known.unwrap_or(vehicles.len());
-        if number == vehicles.len() {
-            vehicles.push((vehicle, 0));
-        }
+        let number = match known {
+            Some(number) => number,
+            None if vehicles.len() == MAX_OTHERS => continue,
+            None => {
+                vehicles.push((vehicle, 0));
+                vehicles.len() - 1
+            }
+        };
         let parts = &mut vehicles[number].1;
         *parts += 1;
-        if number < MAX_OTHERS && *parts <= MAX_PARTS_COMPARED {
+        if *parts <= MAX_PARTS_COMPARED {
             placed.push(PlacedReport {
                 witness: 1 << number,
                 ..PlacedReport::of(report)
