@@ -158,7 +158,9 @@ impl Disturbance {
             | Kind::OneWay => trouble.kind == "node_missing" && is_struck,
             Kind::Flood => is_intruder && is_one_of(&FLOOD_TROUBLES),
             Kind::BadInput => is_intruder && is_one_of(&JUNK_TROUBLES),
-            Kind::Busy | Kind::Loss => false,
+            // Reports wait until TCP has repeated what was lost.
+            Kind::Loss => trouble.kind == "untimely",
+            Kind::Busy => false,
         }
     }
 
