@@ -135,7 +135,10 @@ impl RoundFilter {
         self.check_origin(&epoch, origin)?;
         self.maps
             .admit(&epoch, map.round, received_at, leadership)?;
-        check_age(&mut self.map_age, &epoch, map.fused_at_us, received_at)?;
+        if !self.map_age.is_fresh(&epoch, map.fused_at_us, received_at) {
+            self.maps.on_stale();
+            return Err(Refusal::Stale);
+        }
         self.record_origin(&epoch, origin);
         self.map_accepted_at = Some(received_at);
         Ok(accepted(epoch, map.round, true, leadership))
@@ -156,12 +159,13 @@ impl RoundFilter {
         self.check_origin(&epoch, origin)?;
         self.verdicts
             .admit(&epoch, verdicts.round, received_at, leadership)?;
-        check_age(
-            &mut self.verdict_age,
-            &epoch,
-            verdicts.fused_at_us,
-            received_at,
-        )?;
+        if !self
+            .verdict_age
+            .is_fresh(&epoch, verdicts.fused_at_us, received_at)
+        {
+            self.verdicts.on_stale();
+            return Err(Refusal::Stale);
+        }
         self.record_origin(&epoch, origin);
         let is_sign_of_life = self
             .map_accepted_at
@@ -213,20 +217,6 @@ impl RoundFilter {
 /// stopped. The saved term is one higher, because a node writes the next term to disk in advance.
 fn floor(saved_term: u64) -> u64 {
     saved_term.saturating_sub(1)
-}
-
-/// Refuses a round that was in transit for too long by its time of fusion; see [`StalenessFilter`].
-fn check_age(
-    filter: &mut StalenessFilter,
-    epoch: &Epoch,
-    fused_at: Timestamp,
-    received_at: Timestamp,
-) -> Result<(), Refusal> {
-    if filter.is_fresh(epoch, fused_at, received_at) {
-        Ok(())
-    } else {
-        Err(Refusal::Stale)
-    }
 }
 
 /// The accepted round, with the facts that its receivers need beside the message.
@@ -307,6 +297,30 @@ mod tests {
         assert_eq!(take(7, 2, 3500), Ok(()), "the clock of its leader is known");
         assert_eq!(take(7, 4, 3700), Ok(()));
         assert_eq!(take(7, 4, 3800), Err(Refusal::Repeated), "not taken twice");
+    }
+
+    /// A broker drops the oldest messages for a receiver that stands still, so that the rounds of a
+    /// long stall arrive together, but not all of them.
+    #[test]
+    fn newest_round_follows_dropped_ones() {
+        let seeking = seeking();
+        let at = |round: u64| ms(100 * round);
+        for (resumed, newest) in [(31, 30), (60, 55)] {
+            let mut filter = RoundFilter::new(0, ms(0));
+            for round in 0..10 {
+                let map = map(7, round, at(round));
+                assert_eq!(take(&mut filter, &map, at(round), &seeking), Ok(()));
+            }
+            for round in 10..13 {
+                let map = map(7, round, at(round));
+                let waited = take(&mut filter, &map, at(resumed), &seeking);
+                assert_eq!(waited, Err(Refusal::Stale), "round {round}");
+            }
+            let map = map(7, newest, at(newest));
+            assert_eq!(take(&mut filter, &map, at(resumed), &seeking), Ok(()));
+            let again = take(&mut filter, &map, at(resumed), &seeking);
+            assert_eq!(again, Err(Refusal::Repeated));
+        }
     }
 
     #[test]

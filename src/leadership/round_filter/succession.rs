@@ -35,8 +35,10 @@ pub struct SuccessionFilter {
     /// True if the topic's last message is retained. In this case any term is accepted while there
     /// is no leader, and the first message may have any age.
     is_retained: bool,
-    /// Arrival of the last admitted message; before any, of the first message.
+    /// Arrival of the last admitted message that was not stale; before any, of the first message.
     newest_at: Option<Timestamp>,
+    /// The same before the newest admitted message.
+    before_newest_at: Option<Timestamp>,
     /// True if the only admitted message may have been retained, and be of any age.
     newest_is_retained: bool,
     elected: Option<Elected>,
@@ -87,6 +89,7 @@ impl SuccessionFilter {
             gate: EpochGate::new(floor),
             is_retained: false,
             newest_at: None,
+            before_newest_at: None,
             newest_is_retained: false,
             elected: None,
             others_since: None,
@@ -142,6 +145,12 @@ impl SuccessionFilter {
             None if self.is_strange(epoch, leadership, received_at) => Err(Refusal::NotElected),
             None => self.admit_in_order(epoch, round, received_at, true),
         }
+    }
+
+    /// The round that was just admitted had waited in a queue: its arrival does not show how many
+    /// rounds the leader has published since.
+    pub fn on_stale(&mut self) {
+        self.newest_at = self.before_newest_at;
     }
 
     /// True if an unconfirmed epoch must not be accepted yet.
@@ -297,7 +306,7 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        self.newest_at = Some(received_at);
+        self.before_newest_at = self.newest_at.replace(received_at);
         self.newest_is_retained = is_first && self.is_retained;
         Ok(())
     }
