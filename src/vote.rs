@@ -20,8 +20,8 @@ mod configured_method;
 mod confusion;
 mod dawid_skene;
 mod dependence;
+mod index_map;
 mod label_bias;
-mod label_map;
 mod label_table;
 mod landmark_table;
 mod landmark_votes;
@@ -36,6 +36,7 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use hashbrown::HashMap;
 use nalgebra::Point2;
 
 pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
@@ -114,7 +115,8 @@ pub struct Vote {
     landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
     /// Landmarks of an open cell.
     named: NamedLandmarks,
-    last_reports: BTreeMap<NodeName, LastReport>,
+    /// Hashed, because the order is irrelevant.
+    last_reports: HashMap<NodeName, LastReport>,
     method: ConfiguredMethod,
     /// Vacancy signs that were recently read, with the time, by vehicle.
     signs: BTreeMap<LandmarkId, BTreeMap<NodeName, Timestamp>>,
@@ -137,7 +139,7 @@ impl Vote {
                 .map(|l| (l.id.clone(), Some(Box::new(l))))
                 .collect(),
             named: NamedLandmarks::default(),
-            last_reports: BTreeMap::new(),
+            last_reports: HashMap::new(),
             method,
             signs: BTreeMap::new(),
             ignored: 0,
@@ -327,7 +329,8 @@ impl Vote {
             return false;
         };
         let known = self.landmarks.get(id);
-        if known.is_none() && !self.open {
+        let is_new = known.is_none();
+        if is_new && !self.open {
             return false;
         }
         let landmark = known.and_then(Option::as_deref);
@@ -361,7 +364,7 @@ impl Vote {
             return false;
         };
         self.ignored += dropped as u64;
-        if !self.landmarks.contains_key(id) {
+        if is_new {
             self.open_landmark(id, &report.node);
         }
         self.method.get_mut().add_vote(&vote);
