@@ -40,6 +40,11 @@ impl LandmarkTable {
         self.indices.get(id).copied()
     }
 
+    /// The landmarks, by name.
+    pub(super) fn names(&self) -> impl Iterator<Item = &LandmarkId> {
+        self.indices.keys()
+    }
+
     /// The landmark of an index in use.
     pub(super) fn id(&self, index: usize) -> &LandmarkId {
         &self.entries[index].id

@@ -285,12 +285,14 @@ impl LandmarkVotes {
     }
 
     /// Stores a vehicle's vote in place of its earlier one. Millions of votes may be stored, so room
-    /// is made for no more than there are.
+    /// is made for at most one more than there are.
     pub(super) fn store(&mut self, vote: StoredVote) {
         match self.place(vote.vehicle) {
             Ok(place) => self.votes[place] = vote,
             Err(place) => {
-                self.votes.reserve_exact(1);
+                if self.votes.len() == self.votes.capacity() {
+                    self.votes.reserve_exact(2);
+                }
                 self.votes.insert(place, vote);
             }
         }

@@ -214,6 +214,14 @@ impl VotingMethod for WeightedVoting {
         self.landmarks.remove(landmark);
     }
 
+    fn has_landmark(&self, landmark: &LandmarkId) -> bool {
+        self.landmarks.index(landmark).is_some()
+    }
+
+    fn landmarks(&self) -> Vec<LandmarkId> {
+        self.landmarks.names().cloned().collect()
+    }
+
     /// Removes the vehicles' votes and all evidence about them; other vehicles reuse their indices.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.evict_vehicles(nodes);
