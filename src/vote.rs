@@ -20,8 +20,8 @@ mod configured_method;
 mod confusion;
 mod dawid_skene;
 mod dependence;
+mod index_map;
 mod label_bias;
-mod label_map;
 mod label_table;
 mod landmark_table;
 mod landmark_votes;
@@ -36,6 +36,7 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use hashbrown::HashMap;
 use nalgebra::Point2;
 
 pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
@@ -110,11 +111,12 @@ pub struct Vote {
     config: VoteConfig,
     /// Whether landmarks are taken from the reports.
     open: bool,
-    /// `None` for a landmark of an open cell.
-    landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
+    /// Listed landmarks; none in an open cell.
+    landmarks: BTreeMap<LandmarkId, Landmark>,
     /// Landmarks of an open cell.
     named: NamedLandmarks,
-    last_reports: BTreeMap<NodeName, LastReport>,
+    /// Hashed, because the order is irrelevant.
+    last_reports: HashMap<NodeName, LastReport>,
     method: ConfiguredMethod,
     /// Vacancy signs that were recently read, with the time, by vehicle.
     signs: BTreeMap<LandmarkId, BTreeMap<NodeName, Timestamp>>,
@@ -132,12 +134,9 @@ impl Vote {
         Self {
             config,
             open: landmarks.is_empty(),
-            landmarks: landmarks
-                .into_iter()
-                .map(|l| (l.id.clone(), Some(Box::new(l))))
-                .collect(),
+            landmarks: landmarks.into_iter().map(|l| (l.id.clone(), l)).collect(),
             named: NamedLandmarks::default(),
-            last_reports: BTreeMap::new(),
+            last_reports: HashMap::new(),
             method,
             signs: BTreeMap::new(),
             ignored: 0,
@@ -157,27 +156,24 @@ impl Vote {
         let method = self.method.get_mut();
         method.configure(&config);
         let is_open = landmarks.is_empty();
-        let mut known: BTreeMap<_, _> = landmarks
-            .into_iter()
-            .map(|l| (l.id.clone(), Some(Box::new(l))))
-            .collect();
+        let listed: BTreeMap<_, _> = landmarks.into_iter().map(|l| (l.id.clone(), l)).collect();
         if is_open {
-            for id in self.landmarks.keys().filter(|_| !self.open) {
+            for id in self.landmarks.keys() {
                 self.named.add(id, None, usize::MAX);
             }
-            known.extend(self.landmarks.into_keys().map(|id| (id, None)));
         } else {
             self.named.clear();
-            known.keys().for_each(|id| method.add_landmark(id.clone()));
-            self.landmarks
-                .keys()
-                .filter(|id| !known.contains_key(*id))
-                .for_each(|id| method.remove_landmark(id));
+            listed.keys().for_each(|id| method.add_landmark(id.clone()));
+            for id in method.landmarks() {
+                if !listed.contains_key(&id) {
+                    method.remove_landmark(&id);
+                }
+            }
         }
         Self {
             config,
             open: is_open,
-            landmarks: known,
+            landmarks: listed,
             ..self
         }
     }
@@ -297,7 +293,7 @@ impl Vote {
                     let landmark = object
                         .landmark
                         .as_ref()
-                        .and_then(|id| self.landmarks.get(id)?.as_deref());
+                        .and_then(|id| self.landmarks.get(id));
                     let rank = |object: &PerceivedObject| {
                         (
                             !self.is_sign(landmark, self.voted_label(landmark, &object.label)),
@@ -326,11 +322,10 @@ impl Vote {
         let Some(id) = object.landmark.as_ref().filter(|_| object.confidence > 0.0) else {
             return false;
         };
-        let known = self.landmarks.get(id);
-        if known.is_none() && !self.open {
+        let landmark = self.landmarks.get(id);
+        if landmark.is_none() && !self.open {
             return false;
         }
-        let landmark = known.and_then(Option::as_deref);
         let position = landmark.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
         let label = self.voted_label(landmark, &object.label).clone();
         let is_sign = self.is_sign(landmark, &label);
@@ -361,7 +356,7 @@ impl Vote {
             return false;
         };
         self.ignored += dropped as u64;
-        if !self.landmarks.contains_key(id) {
+        if self.open && !self.method.get().has_landmark(id) {
             self.open_landmark(id, &report.node);
         }
         self.method.get_mut().add_vote(&vote);
@@ -411,7 +406,7 @@ impl Vote {
     pub fn readings(&self, landmark: &LandmarkId, now: Timestamp) -> Vec<LabelReading> {
         let mut readings = self.method.get().readings(landmark);
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
-        let known = self.landmarks.get(landmark).and_then(Option::as_deref);
+        let known = self.landmarks.get(landmark);
         if let (Some(sign), Some(signs)) = (
             known.and_then(|l| l.vacancy.as_ref()),
             self.signs.get(landmark),
@@ -441,10 +436,8 @@ impl Vote {
     fn open_landmark(&mut self, landmark: &LandmarkId, vehicle: &NodeName) {
         let max = self.config.max_landmarks;
         if let Some(dropped) = self.named.add(landmark, Some(vehicle), max) {
-            self.landmarks.remove(&dropped);
             self.method.get_mut().remove_landmark(&dropped);
         }
-        self.landmarks.insert(landmark.clone(), None);
     }
 
     /// Whether a vehicle has sent a full packet of frames since the last verdict (`paper` mode).
@@ -504,9 +497,8 @@ impl Vote {
 
     /// The verdict of every landmark as of the last round, by landmark.
     pub fn verdicts(&self) -> impl Iterator<Item = Verdict> {
-        self.landmarks
-            .keys()
-            .filter_map(|landmark| self.method.get().verdict(landmark))
+        let landmarks = self.method.get().landmarks().into_iter();
+        landmarks.filter_map(|landmark| self.method.get().verdict(&landmark))
     }
 
     /// Re-evaluates the stored votes `passes` times, starting from equal trust; returns the verdict

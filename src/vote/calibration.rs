@@ -112,14 +112,12 @@ impl ConfidenceCalibration {
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
     pub(super) fn band(&self, vehicle: usize, confidence: f64) -> Band {
-        let (stated, total) = self
-            .histograms
-            .get(vehicle)
-            .map_or(([0.0; BINS], 0.0), |s| (s.stated, s.total));
         let bin = bin(confidence);
-        let below: f64 = stated[..bin].iter().sum();
-        let rank =
-            (below + 0.5 * stated[bin] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
+        let counts = self.histograms.get(vehicle).map_or((0.0, 0.0, 0.0), |all| {
+            (all.stated[..bin].iter().sum(), all.stated[bin], all.total)
+        });
+        let (below, equal, total) = counts;
+        let rank = (below + 0.5 * equal + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
         ((rank * BANDS as f64) as Band).min(BANDS as Band - 1)
     }
 

@@ -12,10 +12,12 @@
 
 use std::collections::BTreeSet;
 
+use smallvec::SmallVec;
+
 use super::config::WeightedConfig;
 use super::confusion::Confusion;
+use super::index_map::LabelIndex;
 use super::label_bias::LabelBias;
-use super::label_map::LabelIndex;
 use super::likelihood::{
     LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability,
 };
@@ -227,7 +229,7 @@ impl DawidSkene {
         votes: &[WeightedVote],
         candidates: &[LabelIndex],
     ) -> LandmarkPosterior {
-        let likelihoods: Vec<_> = votes
+        let likelihoods: SmallVec<[Likelihood; 4]> = votes
             .iter()
             .map(|vote| self.likelihood(vote, candidates))
             .collect();
@@ -284,7 +286,8 @@ impl DawidSkene {
         posterior: &[(LabelIndex, f64)],
         vote: &WeightedVote,
     ) -> Posterior {
-        let candidates: Vec<_> = posterior.iter().map(|(label, _)| *label).collect();
+        let candidates: SmallVec<[LabelIndex; 4]> =
+            posterior.iter().map(|(label, _)| *label).collect();
         self.likelihood(vote, &candidates)
             .leave_out(vote, posterior)
     }
@@ -293,20 +296,26 @@ impl DawidSkene {
     fn likelihood(&self, vote: &WeightedVote, candidates: &[LabelIndex]) -> Likelihood {
         let vehicle = &self.vehicles[vote.vehicle];
         let wrong = (1.0 - vehicle.accuracy) / self.wrong_labels();
-        let prior = self.config.class_prior_votes;
-        let evidence = [&vehicle.live, &vehicle.settled, &vehicle.inherited]
-            .map(|confusion| confusion.stated(vote.label));
-        let stating = candidates.iter().map(|&truth| {
-            let coin = if truth == vote.label {
+        let coin = |truth: LabelIndex| {
+            if truth == vote.label {
                 vehicle.accuracy
             } else {
                 wrong
-            };
-            if self.class_weight == 0.0 {
-                return coin;
             }
-            let stated: f64 = evidence.iter().map(|e| e.where_true(truth)).sum();
-            let votes: f64 = evidence.iter().map(|e| e.all_where_true(truth)).sum();
+        };
+        if self.class_weight == 0.0 {
+            return Likelihood::new(
+                vote,
+                candidates,
+                candidates.iter().map(|&truth| coin(truth)),
+            );
+        }
+        let prior = self.config.class_prior_votes;
+        let evidence = [&vehicle.live, &vehicle.settled, &vehicle.inherited];
+        let stating = candidates.iter().map(|&truth| {
+            let coin = coin(truth);
+            let stated: f64 = evidence.iter().map(|e| e.votes(vote.label, truth)).sum();
+            let votes: f64 = evidence.iter().map(|e| e.all_votes(truth)).sum();
             let own = (stated + prior * coin) / (votes + prior);
             coin + self.class_weight * (own - coin)
         });

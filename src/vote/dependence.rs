@@ -12,9 +12,9 @@
 //! *vehicles* is assumed to be honest, however closely the others agree. The method therefore
 //! withstands malicious vehicles only if they are fewer than half.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-use super::label_map::LabelIndex;
+use super::index_map::{IndexMap, LabelIndex};
 
 /// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost
 /// of a vote.
@@ -78,6 +78,35 @@ impl Pair {
     }
 }
 
+/// Pairs of vehicles by the lower index of both, then by the higher one.
+#[derive(Debug, Clone, Default)]
+struct Pairs(Vec<IndexMap<u32, Pair>>);
+
+impl Pairs {
+    fn entry(&mut self, one: usize, other: usize) -> &mut Pair {
+        let lower = one.min(other);
+        if self.0.len() <= lower {
+            self.0.resize_with(lower + 1, IndexMap::default);
+        }
+        self.0[lower].entry(one.max(other) as u32)
+    }
+
+    /// Both vehicles of each pair and the pair, in order of the vehicles.
+    fn iter(&self) -> impl Iterator<Item = (usize, usize, &Pair)> {
+        (0..).zip(&self.0).flat_map(|(one, pairs)| {
+            let pairs = pairs.iter();
+            pairs.map(move |(other, pair)| (one, other as usize, pair))
+        })
+    }
+
+    fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
+        for (one, pairs) in self.0.iter_mut().enumerate() {
+            let is_gone = |other| vehicles.contains(&one) || vehicles.contains(&(other as usize));
+            pairs.retain(|other, _| !is_gone(other));
+        }
+    }
+}
+
 /// Vehicles by group, the result of a fit.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct AgreementGroups {
@@ -96,7 +125,9 @@ pub(super) struct Dependence {
     memory: f64,
     max_compared: usize,
     significance: f64,
-    pairs: BTreeMap<(usize, usize), Pair>,
+    pairs: Pairs,
+    /// Number of pairs.
+    known: usize,
     /// Votes for each label, their sum and the sum of their squares.
     stated: Vec<f64>,
     total: f64,
@@ -138,8 +169,8 @@ impl Dependence {
 
     /// Removes vehicles, whose indices may be reused.
     pub(super) fn remove_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
-        self.pairs
-            .retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
+        self.pairs.remove_vehicles(vehicles);
+        self.known = self.pairs.iter().count();
         self.partners
             .iter_mut()
             .for_each(|partners| partners.retain(|(other, _)| !vehicles.contains(other)));
@@ -195,13 +226,8 @@ impl Dependence {
         self.count_label(other.label);
         let chance = self.squares / (self.total * self.total);
         let fade = 1.0 - 1.0 / self.memory;
-        let pair = self
-            .pairs
-            .entry((
-                one.vehicle.min(other.vehicle),
-                one.vehicle.max(other.vehicle),
-            ))
-            .or_default();
+        let pair = self.pairs.entry(one.vehicle, other.vehicle);
+        self.known += usize::from(pair.compared == 0.0);
         pair.compared = pair.compared * fade + 1.0;
         pair.agreed = pair.agreed * fade + f64::from(one.label == other.label);
         pair.chance = pair.chance * fade + chance;
@@ -239,7 +265,7 @@ impl Dependence {
 
     /// Whether a fit is due: it then costs at most as much as the comparisons since the last one.
     pub(super) fn is_due(&self) -> bool {
-        self.compared >= self.pairs.len().max(64)
+        self.compared >= self.known.max(64)
     }
 
     /// Finds the dependent pairs again; only vehicles that are `present` count for the main group.
@@ -255,26 +281,22 @@ impl Dependence {
             }
         };
         let influences: Vec<f64> = (0..vehicles).map(influence).collect();
-        let pairs: Vec<_> = self
-            .pairs
-            .iter()
-            .map(|(&(one, other), &pair)| (one, other, pair))
-            .collect();
-        let belonging = main_group(&influences, &pairs);
-        let typical = typical_agreement(&belonging, &pairs);
+        let pairs = &self.pairs;
+        let belonging = main_group(&influences, pairs);
+        let typical = typical_agreement(&belonging, pairs);
         let mut rhos: Vec<f64> = pairs
             .iter()
             .map(|(_, _, pair)| pair.excess(typical, self.significance))
             .collect();
         let mut factors = vec![0.5; vehicles];
         for _ in 0..FACTOR_STEPS {
-            factors = next_factors(&factors, &belonging, &pairs, &rhos);
-            for (rho, (one, other, pair)) in rhos.iter_mut().zip(&pairs) {
-                *rho = pair.excess(factors[*one] * factors[*other], self.significance);
+            factors = next_factors(&factors, &belonging, pairs, &rhos);
+            for (rho, (one, other, pair)) in rhos.iter_mut().zip(pairs.iter()) {
+                *rho = pair.excess(factors[one] * factors[other], self.significance);
             }
         }
         self.partners = vec![Vec::new(); vehicles];
-        for ((one, other, _), rho) in pairs.into_iter().zip(rhos).filter(|(_, rho)| *rho > 0.0) {
+        for ((one, other, _), rho) in pairs.iter().zip(rhos).filter(|(_, rho)| *rho > 0.0) {
             self.partners[one].push((other, rho));
             self.partners[other].push((one, rho));
         }
@@ -291,15 +313,15 @@ impl Dependence {
 
 /// Membership of each vehicle, 0 to 1, in the largest group that agrees: a dominant set (Pavan &
 /// Pelillo 2007). It is found by power iteration that drops negative parts.
-fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
+fn main_group(influences: &[f64], pairs: &Pairs) -> Vec<f64> {
     let mut belonging = influences.to_vec();
     for _ in 0..GROUPING_STEPS {
         let mut support: Vec<f64> = belonging.iter().map(|own| SELF_SUPPORT * own).collect();
-        for (one, other, pair) in pairs {
+        for (one, other, pair) in pairs.iter() {
             let affinity = (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.compared
                 / (pair.compared + PRIOR_COMPARISONS);
-            support[*one] += affinity * belonging[*other];
-            support[*other] += affinity * belonging[*one];
+            support[one] += affinity * belonging[other];
+            support[other] += affinity * belonging[one];
         }
         let most = support.iter().copied().fold(0.0, f64::max);
         if most <= 0.0 {
@@ -315,23 +337,20 @@ fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
 }
 
 /// Mean agreement κ within the main group, of pairs in proportion to their comparisons; at least 0.
-fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
-    let weight = |(one, other, pair): &(usize, usize, Pair)| {
-        belonging[*one] * belonging[*other] * pair.compared
-    };
-    let weights: f64 = pairs.iter().map(weight).sum();
-    let agreed: f64 = pairs.iter().map(|pair| weight(pair) * pair.2.kappa()).sum();
-    (agreed / weights.max(1e-9)).clamp(0.0, 0.99)
+fn typical_agreement(belonging: &[f64], pairs: &Pairs) -> f64 {
+    let mut weights = 0.0;
+    let mut agreed = 0.0;
+    for (one, other, pair) in pairs.iter() {
+        let weight = belonging[one] * belonging[other] * pair.compared;
+        weights += weight;
+        agreed += weight * pair.kappa();
+    }
+    (agreed / f64::max(weights, 1e-9)).clamp(0.0, 0.99)
 }
 
 /// One step of alternating least squares for κ = r_i · r_j. Agreement counts if it is with the main
 /// group and not excessive.
-fn next_factors(
-    factors: &[f64],
-    belonging: &[f64],
-    pairs: &[(usize, usize, Pair)],
-    rhos: &[f64],
-) -> Vec<f64> {
+fn next_factors(factors: &[f64], belonging: &[f64], pairs: &Pairs, rhos: &[f64]) -> Vec<f64> {
     let members: f64 = belonging.iter().sum();
     let typical = factors
         .iter()
@@ -342,7 +361,7 @@ fn next_factors(
     let prior = PRIOR_COMPARISONS * typical * typical;
     let mut sums = vec![(prior * typical, prior); factors.len()];
     for ((one, other, pair), rho) in pairs.iter().zip(rhos) {
-        for (vehicle, reference) in [(*one, *other), (*other, *one)] {
+        for (vehicle, reference) in [(one, other), (other, one)] {
             let weight = belonging[reference] * pair.compared * (1.0 - rho);
             sums[vehicle].0 += weight * pair.kappa() * factors[reference];
             sums[vehicle].1 += weight * factors[reference] * factors[reference];

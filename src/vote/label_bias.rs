@@ -18,7 +18,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::dependence::ComparedVote;
-use super::label_map::{LabelIndex, LabelMap};
+use super::index_map::{LabelIndex, LabelMap};
 
 /// φ₀: the contingency of vehicles and labels up to which one accuracy per vehicle describes them
 /// better than a confusion matrix that is estimated from votes.

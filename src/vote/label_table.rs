@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::label_map::LabelIndex;
+use super::index_map::LabelIndex;
 use crate::model::names::Label;
 use crate::model::time::Timestamp;
 

@@ -27,19 +27,22 @@ impl LandmarkTable {
         self.indices.len()
     }
 
-    /// The index of the landmark that follows in the order of names; of the first one, after
-    /// `None`.
-    pub(super) fn next(&self, after: Option<&LandmarkId>) -> Option<usize> {
+    /// The indices of the landmarks that follow in the order of names; of all, after `None`.
+    pub(super) fn following(&self, after: Option<&LandmarkId>) -> impl Iterator<Item = usize> {
         let after = after.map_or(Bound::Unbounded, Bound::Excluded);
-        let mut rest = self
-            .indices
-            .range::<LandmarkId, _>((after, Bound::Unbounded));
-        rest.next().map(|(_, index)| *index)
+        self.indices
+            .range::<LandmarkId, _>((after, Bound::Unbounded))
+            .map(|(_, index)| *index)
     }
 
     /// The index of a landmark.
     pub(super) fn index(&self, id: &LandmarkId) -> Option<usize> {
         self.indices.get(id).copied()
+    }
+
+    /// The landmarks, by name.
+    pub(super) fn names(&self) -> impl Iterator<Item = &LandmarkId> {
+        self.indices.keys()
     }
 
     /// The landmark of an index in use.
@@ -49,16 +52,14 @@ impl LandmarkTable {
 
     /// The index of a landmark; a new or reused index if the landmark has none.
     pub(super) fn intern(&mut self, id: &LandmarkId) -> usize {
-        if let Some(index) = self.index(id) {
-            return index;
-        }
-        let index = self.free.pop().unwrap_or_else(|| {
-            self.entries.push(LandmarkEntry::default());
-            self.entries.len() - 1
-        });
-        self.entries[index].id = id.clone();
-        self.indices.insert(id.clone(), index);
-        index
+        *self.indices.entry(id.clone()).or_insert_with(|| {
+            let index = self.free.pop().unwrap_or_else(|| {
+                self.entries.push(LandmarkEntry::default());
+                self.entries.len() - 1
+            });
+            self.entries[index].id = id.clone();
+            index
+        })
     }
 
     /// Removes a landmark and its votes; another one may reuse its index.
@@ -75,11 +76,6 @@ impl LandmarkTable {
 
     pub(super) fn votes_mut(&mut self, index: usize) -> &mut LandmarkVotes {
         &mut self.entries[index].votes
-    }
-
-    /// The votes of all landmarks, by index.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &LandmarkVotes> {
-        self.entries.iter().map(|entry| &entry.votes)
     }
 
     /// The votes of all landmarks, by index.

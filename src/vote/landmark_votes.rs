@@ -1,26 +1,30 @@
 //! The votes on one landmark.
 
+use smallvec::SmallVec;
+
 use super::calibration::{Band, ConfidenceCalibration, Weights};
 use super::dependence::{ComparedVote, Dependence};
+use super::index_map::LabelIndex;
 use super::label_bias::LabelBias;
-use super::label_map::LabelIndex;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
 
 /// Independent part of a vehicle's statements, because consecutive frames are similar.
 const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
+/// Minimum weight of a statement among the vehicle's own statements.
+const MIN_WEIGHT: f64 = 0.01;
 /// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
 const NORMAL_TO_LOGISTIC: f64 = 0.8;
 
-/// A vote that currently counts.
-#[derive(Debug, Clone, Copy)]
+/// A vote that currently counts. Millions may be stored.
+#[derive(Debug, Clone)]
 pub(super) struct StoredVote {
     pub(super) vehicle: usize,
     pub(super) label: LabelIndex,
     pub(super) confidence: f64,
     pub(super) visibility: f64,
-    /// The vehicle's latest statements.
-    pub(super) recent: RecentStatements,
+    /// The vehicle's latest statements, if there are several.
+    pub(super) recent: Option<Box<RecentStatements>>,
     pub(super) weight: f64,
     /// Part of the weight that does not depend on other vehicles, 0 to 1.
     pub(super) independence: f64,
@@ -29,9 +33,8 @@ pub(super) struct StoredVote {
     pub(super) since: Timestamp,
     /// Band of its confidence as of the last judgement.
     pub(super) band: Band,
-    /// Probability that the others assign to its label, while the live evidence on confidences
-    /// contains it.
-    pub(super) agreement: Option<f64>,
+    /// Probability that the others assign to its label, as of the last judgement.
+    pub(super) agreement: f64,
     /// Whether the posterior includes it.
     pub(super) judged: bool,
     /// Whether it has been compared with the other vehicles' votes since it began to count.
@@ -63,7 +66,7 @@ impl RecentStatements {
         let least = places.clone().min_by(by_sum);
         let stated = known.or(least).unwrap_or_default();
         self.labels[stated] = label;
-        self.sums[stated] = weight + known.map_or(0.0, |known| self.sums[known]);
+        self.sums[stated] = weight.max(MIN_WEIGHT) + known.map_or(0.0, |known| self.sums[known]);
         let by_sum = |a: &usize, b: &usize| self.sums[*a].total_cmp(&self.sums[*b]);
         let more = places.filter(|&place| self.sums[place] > self.sums[stated]);
         self.labels[more.max_by(by_sum).unwrap_or(stated)]
@@ -82,7 +85,7 @@ impl RecentStatements {
     /// Certainty, 0 to 1, that the most stated label is not due to chance: the lead over the next
     /// label in standard deviations of a multinomial draw, as a two-sided probability. A vehicle
     /// that alternates between two labels has almost no vote.
-    pub(super) fn certainty(&self) -> f64 {
+    fn certainty(&self) -> f64 {
         let mut sums = self.sums;
         sums.sort_by(f64::total_cmp);
         let [third, second, first] = sums;
@@ -95,6 +98,15 @@ impl RecentStatements {
 }
 
 impl StoredVote {
+    /// The vehicle's latest statements.
+    pub(super) fn recent(&self) -> RecentStatements {
+        self.recent.as_deref().copied().unwrap_or_else(|| {
+            let mut first = RecentStatements::default();
+            first.add(self.label, self.confidence * self.visibility, 0.0);
+            first
+        })
+    }
+
     pub(super) fn weighted(&self) -> WeightedVote {
         WeightedVote {
             vehicle: self.vehicle,
@@ -113,6 +125,8 @@ pub(super) struct LandmarkVotes {
     pub(super) posterior: Posterior,
     /// Whether the live evidence currently contains votes and posterior.
     pub(super) counted: bool,
+    /// Whether the live evidence on confidences currently contains the votes' agreements.
+    pub(super) agreements_counted: bool,
     /// The label of the verdict.
     pub(super) published: Option<LabelIndex>,
     /// When its oldest vote goes stale.
@@ -131,12 +145,12 @@ impl LandmarkVotes {
             .binary_search_by_key(&vehicle, |vote| vote.vehicle)
     }
 
-    pub(super) fn weighted_votes(&self) -> Vec<WeightedVote> {
+    pub(super) fn weighted_votes(&self) -> SmallVec<[WeightedVote; 4]> {
         self.votes.iter().map(StoredVote::weighted).collect()
     }
 
-    pub(super) fn candidates(&self) -> Vec<LabelIndex> {
-        let mut labels: Vec<_> = self.votes.iter().map(|c| c.label).collect();
+    pub(super) fn candidates(&self) -> SmallVec<[LabelIndex; 4]> {
+        let mut labels: SmallVec<[LabelIndex; 4]> = self.votes.iter().map(|c| c.label).collect();
         labels.sort_unstable();
         labels.dedup();
         labels
@@ -179,14 +193,13 @@ impl LandmarkVotes {
         weights: &Weights,
     ) {
         for place in 0..self.votes.len() {
-            let StoredVote {
+            let &StoredVote {
                 vehicle,
                 label,
                 confidence,
                 visibility,
-                recent,
                 ..
-            } = self.votes[place];
+            } = &self.votes[place];
             let agrees = |other: usize| {
                 self.of_vehicle(other)
                     .is_some_and(|vote| vote.label == label)
@@ -196,7 +209,10 @@ impl LandmarkVotes {
             let vote = &mut self.votes[place];
             vote.independence = independence;
             vote.band = band;
-            vote.weight = weights.of(band, confidence) * visibility * recent.certainty();
+            vote.weight = weights.of(band, confidence) * visibility;
+            if let Some(recent) = &vote.recent {
+                vote.weight *= recent.certainty();
+            }
         }
     }
 
@@ -210,8 +226,9 @@ impl LandmarkVotes {
         if self.has_several_voters() {
             for (vote, agreement) in self.votes.iter_mut().zip(judged.agreements) {
                 calibration.count(vote.band, agreement, 1.0);
-                vote.agreement = Some(agreement);
+                vote.agreement = agreement;
             }
+            self.agreements_counted = true;
         }
         self.posterior = judged.labels;
     }
@@ -251,11 +268,11 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Removes labels with the votes for them; returns the number of votes. Not allowed while they
-    /// are counted.
-    pub(super) fn remove_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
-        let votes = self.votes.len();
-        self.votes.retain(|vote| !is_gone(vote.label));
+    /// Removes labels with the votes for them; returns the vehicles of these votes. Not allowed
+    /// while they are counted.
+    pub(super) fn remove_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> Vec<usize> {
+        let gone = self.votes.extract_if(.., |vote| is_gone(vote.label));
+        let vehicles = gone.map(|vote| vote.vehicle).collect();
         self.posterior.retain(|(label, _)| !is_gone(*label));
         self.published = self.published.filter(|label| !is_gone(*label));
         let total: f64 = self.posterior.iter().map(|(_, p)| p).sum();
@@ -264,16 +281,18 @@ impl LandmarkVotes {
         } else {
             self.posterior.clear();
         }
-        votes - self.votes.len()
+        vehicles
     }
 
     /// Stores a vehicle's vote in place of its earlier one. Millions of votes may be stored, so room
-    /// is made for no more than there are.
+    /// is made for at most one more than there are.
     pub(super) fn store(&mut self, vote: StoredVote) {
         match self.place(vote.vehicle) {
             Ok(place) => self.votes[place] = vote,
             Err(place) => {
-                self.votes.reserve_exact(1);
+                if self.votes.len() == self.votes.capacity() {
+                    self.votes.reserve_exact(2);
+                }
                 self.votes.insert(place, vote);
             }
         }

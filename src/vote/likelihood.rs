@@ -1,6 +1,8 @@
 //! Likelihood of votes and the posterior that follows from it.
 
-use super::label_map::LabelIndex;
+use smallvec::SmallVec;
+
+use super::index_map::LabelIndex;
 
 /// A vote in the form for the model.
 #[derive(Debug, Clone, Copy)]
@@ -15,13 +17,13 @@ pub(super) struct WeightedVote {
 }
 
 /// Probabilities of labels.
-pub(super) type Posterior = Vec<(LabelIndex, f64)>;
+pub(super) type Posterior = SmallVec<[(LabelIndex, f64); 2]>;
 
 /// Evaluation of a landmark by all its votes.
 pub(super) struct LandmarkPosterior {
     pub(super) labels: Posterior,
     /// Probability of each vote's label given the other votes.
-    pub(super) agreements: Vec<f64>,
+    pub(super) agreements: SmallVec<[f64; 4]>,
 }
 
 /// Likelihood of one vote, by candidate for the true label.
@@ -30,7 +32,7 @@ pub(super) struct Likelihood {
     /// where the stated label is true, so that a vote does not count against its own label.
     /// Otherwise the model has a mirrored solution, in which the honest majority counts as
     /// consistently wrong.
-    pub(super) logs: Vec<f64>,
+    pub(super) logs: SmallVec<[f64; 2]>,
     /// The logarithm where the stated label is true.
     own_log: f64,
 }
@@ -42,7 +44,7 @@ impl Likelihood {
         candidates: &[LabelIndex],
         stating: impl Iterator<Item = f64>,
     ) -> Self {
-        let mut logs: Vec<f64> = stating.map(|p| p.max(1e-12).ln()).collect();
+        let mut logs: SmallVec<[f64; 2]> = stating.map(|p| p.max(1e-12).ln()).collect();
         let own_log = candidates
             .iter()
             .zip(&logs)
@@ -66,7 +68,7 @@ impl Likelihood {
         if normalise(&mut others) {
             others
         } else {
-            posterior.to_vec()
+            posterior.into()
         }
     }
 }

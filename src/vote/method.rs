@@ -31,6 +31,11 @@ pub(super) trait VotingMethod {
 
     fn remove_landmark(&mut self, landmark: &LandmarkId);
 
+    fn has_landmark(&self, landmark: &LandmarkId) -> bool;
+
+    /// All landmarks, by name.
+    fn landmarks(&self) -> Vec<LandmarkId>;
+
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>);
 
     /// Makes room for the label of a vote; returns the number of votes dropped for it, or `None` if

@@ -4,10 +4,14 @@ use std::collections::{BTreeMap, VecDeque};
 
 use crate::model::names::{LandmarkId, NodeName};
 
-/// The landmarks by the vehicle that named them first, `None` for landmarks of a former list; each
-/// vehicle's oldest landmark is first.
+/// Names of landmarks with the vehicles that named them first.
 #[derive(Debug, Clone, Default)]
-pub(super) struct NamedLandmarks(BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>);
+pub(super) struct NamedLandmarks {
+    /// By vehicle, `None` for landmarks of a former list; each vehicle's oldest landmark is first.
+    by_vehicle: BTreeMap<Option<NodeName>, VecDeque<LandmarkId>>,
+    /// Number of landmarks of all vehicles.
+    len: usize,
+}
 
 impl NamedLandmarks {
     /// Adds a landmark. If there are `max` already, drops and returns the oldest landmark of the
@@ -20,15 +24,16 @@ impl NamedLandmarks {
     ) -> Option<LandmarkId> {
         let vehicle = vehicle.cloned();
         let mut dropped = None;
-        if self.0.values().map(VecDeque::len).sum::<usize>() >= max {
-            let most = self.0.iter_mut().max_by_key(|(owner, named)| {
+        if self.len >= max {
+            let most = self.by_vehicle.iter_mut().max_by_key(|(owner, named)| {
                 let is_own = **owner == vehicle;
                 (named.len() + usize::from(is_own), is_own)
             });
             dropped = most.and_then(|(_, named)| named.pop_front());
-            self.0.retain(|_, named| !named.is_empty());
+            self.by_vehicle.retain(|_, named| !named.is_empty());
         }
-        self.0
+        self.len = self.len + 1 - usize::from(dropped.is_some());
+        self.by_vehicle
             .entry(vehicle)
             .or_default()
             .push_back(landmark.clone());
@@ -36,7 +41,7 @@ impl NamedLandmarks {
     }
 
     pub(super) fn clear(&mut self) {
-        self.0.clear();
+        *self = Self::default();
     }
 }
 

@@ -86,6 +86,16 @@ impl VotingMethod for PaperVoting {
         self.landmarks.remove(landmark);
     }
 
+    fn has_landmark(&self, landmark: &LandmarkId) -> bool {
+        self.landmarks.contains_key(landmark)
+    }
+
+    fn landmarks(&self) -> Vec<LandmarkId> {
+        let mut landmarks: Vec<_> = self.landmarks.keys().cloned().collect();
+        landmarks.sort_unstable();
+        landmarks
+    }
+
     /// Removes reputations and names; the votes remain in the sums.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));

@@ -10,11 +10,13 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
+use hashbrown::HashMap;
+
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::config::{VoteConfig, WeightedConfig};
 use super::dawid_skene::{DawidSkene, VehicleEvidence};
 use super::dependence::Dependence;
-use super::label_map::LabelIndex;
+use super::index_map::LabelIndex;
 use super::label_table::LabelTable;
 use super::landmark_table::LandmarkTable;
 use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
@@ -26,8 +28,6 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{Reputation, Verdict};
 
-/// Minimum weight of a statement among the vehicle's own statements.
-const MIN_WEIGHT: f64 = 0.01;
 /// Share of dependent vehicles among the present ones from which they may have decided verdicts.
 const MANY_DEPENDENT: f64 = 0.2;
 
@@ -39,13 +39,15 @@ pub(super) struct WeightedVoting {
     calibration: ConfidenceCalibration,
     dependence: Dependence,
     /// Index of each vehicle.
-    vehicles: BTreeMap<NodeName, usize>,
+    vehicles: HashMap<NodeName, usize>,
     /// By index of the vehicle.
     names: Vec<NodeName>,
     /// Indices of removed vehicles.
     free: Vec<usize>,
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
+    /// Number of stored votes, by index of the vehicle.
+    stored: Vec<usize>,
     labels: LabelTable,
     landmarks: LandmarkTable,
     /// Indices of the landmarks to evaluate when the round closes.
@@ -89,6 +91,7 @@ impl WeightedVoting {
         } else {
             self.names.push(node.clone());
             self.counts.push(Counts::default());
+            self.stored.push(0);
             self.model.vehicles.push(VehicleEvidence::default());
             self.names.len() - 1
         };
@@ -128,11 +131,7 @@ impl WeightedVoting {
     /// learning starts again. Learning also starts again if many vehicles turn out to be dependent,
     /// because their agreement was mistaken for reliability.
     fn fit_dependence(&mut self) {
-        let mut present = vec![false; self.names.len()];
-        self.landmarks
-            .iter()
-            .flat_map(|l| &l.votes)
-            .for_each(|vote| present[vote.vehicle] = true);
+        let present: Vec<bool> = self.stored.iter().map(|votes| *votes > 0).collect();
         let groups = self.dependence.fit(&present);
         let trust = |vehicles: &[usize]| {
             vehicles
@@ -158,17 +157,24 @@ impl WeightedVoting {
     fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<usize>) {
         let mut budget =
             (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
-        let mut visits = self.landmarks.len();
-        while budget > 0 && visits > 0 {
-            visits -= 1;
-            let Some(landmark) = self.landmarks.next(self.revisit_after.as_ref()) else {
-                self.revisit_after = None;
-                continue;
-            };
-            self.revisit_after = Some(self.landmarks.id(landmark).clone());
-            let landmark_votes = self.landmarks.votes(landmark);
-            budget = budget.saturating_sub(landmark_votes.votes.len().max(1));
-            let before = landmark_votes.published;
+        // `None` is the end of the names.
+        let mut visits: Vec<Option<usize>> = Vec::new();
+        let rest = self.landmarks.following(self.revisit_after.as_ref());
+        let all = self.landmarks.following(None);
+        let turn = rest.map(Some).chain([None]).chain(all.map(Some));
+        for visit in turn.take(self.landmarks.len()) {
+            if budget == 0 {
+                break;
+            }
+            let cost = |landmark| self.landmarks.votes(landmark).votes.len().max(1);
+            budget = budget.saturating_sub(visit.map_or(0, cost));
+            visits.push(visit);
+        }
+        if let Some(last) = visits.last() {
+            self.revisit_after = last.map(|landmark| self.landmarks.id(landmark).clone());
+        }
+        for landmark in visits.into_iter().flatten() {
+            let before = self.landmarks.votes(landmark).published;
             self.judge(landmark, weights);
             if self.landmarks.votes(landmark).published != before {
                 changed.insert(landmark);
@@ -208,6 +214,14 @@ impl VotingMethod for WeightedVoting {
         self.landmarks.remove(landmark);
     }
 
+    fn has_landmark(&self, landmark: &LandmarkId) -> bool {
+        self.landmarks.index(landmark).is_some()
+    }
+
+    fn landmarks(&self) -> Vec<LandmarkId> {
+        self.landmarks.names().cloned().collect()
+    }
+
     /// Removes the vehicles' votes and all evidence about them; other vehicles reuse their indices.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.evict_vehicles(nodes);
@@ -228,17 +242,21 @@ impl VotingMethod for WeightedVoting {
         let label = self.label(vote.label, Some((vehicle, at)));
         let landmark = self.landmarks.intern(vote.landmark);
         let freshness = self.freshness();
-        let earlier = self.landmarks.votes(landmark).of_vehicle(vehicle).copied();
-        let mut recent = earlier.map_or_else(RecentStatements::default, |earlier| earlier.recent);
-        let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
+        let earlier = self.landmarks.votes(landmark).of_vehicle(vehicle).cloned();
+        let mut recent = earlier
+            .as_ref()
+            .map_or_else(RecentStatements::default, StoredVote::recent);
+        let age_s = earlier
+            .as_ref()
+            .map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
         let fading_s = self.config.freshness_s * self.config.smoothing_share;
         let kept = if fading_s > 0.0 {
             (-age_s / fading_s).exp()
         } else {
             0.0
         };
-        let stated_most = recent.add(label, (confidence * visibility).max(MIN_WEIGHT), kept);
-        let (label, confidence, visibility) = match earlier {
+        let stated_most = recent.add(label, confidence * visibility, kept);
+        let (label, confidence, visibility) = match &earlier {
             Some(earlier) if stated_most != label => {
                 (earlier.label, earlier.confidence, earlier.visibility)
             }
@@ -249,13 +267,13 @@ impl VotingMethod for WeightedVoting {
             label,
             confidence,
             visibility,
-            recent,
+            recent: earlier.is_some().then(|| Box::new(recent)),
             weight: 1.0,
             independence: 1.0,
             at,
             since: at,
             band: 0,
-            agreement: None,
+            agreement: 0.0,
             judged: false,
             compared: false,
         };
@@ -266,30 +284,25 @@ impl VotingMethod for WeightedVoting {
             }
             Some(earlier) => {
                 self.remove_live(landmark);
-                let StoredVote {
-                    since, compared, ..
-                } = earlier;
-                let is_repeated = earlier.label == label;
-                let rest = if is_repeated {
+                if earlier.label == label {
                     StoredVote {
                         confidence,
                         visibility,
-                        recent,
+                        recent: first.recent,
                         at,
                         ..earlier
                     }
                 } else {
-                    first
-                };
-                StoredVote {
-                    since,
-                    compared,
-                    agreement: None,
-                    ..rest
+                    StoredVote {
+                        since: earlier.since,
+                        compared: earlier.compared,
+                        ..first
+                    }
                 }
             }
             None => {
                 self.remove_live(landmark);
+                self.stored[vehicle] += 1;
                 first
             }
         };

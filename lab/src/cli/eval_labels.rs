@@ -45,11 +45,7 @@ pub(super) fn run(arguments: &EvalLabelsArguments) -> Result<(), Failure> {
         check_apart(out, &inputs).map_err(Failure::usage)?;
     }
     let config = cell(arguments.config.as_deref())?.fusion.vote.weighted;
-    let answers = read(&arguments.answers)?;
-    let truths = arguments.truth.as_deref().map(read).transpose()?;
-    let set = LabelSet::parse(&answers, truths.as_deref())
-        .with_context(|| arguments.answers.display().to_string())
-        .map_err(Failure::usage)?;
+    let set = read_set(arguments)?;
     println!(
         "{} items ({} with a truth), {} answers of {} voters, {} labels",
         set.items.len(),
@@ -84,6 +80,14 @@ pub(super) fn run(arguments: &EvalLabelsArguments) -> Result<(), Failure> {
         write(out, &set, &decisions)?;
     }
     Ok(())
+}
+
+fn read_set(arguments: &EvalLabelsArguments) -> Result<LabelSet, Failure> {
+    let answers = read(&arguments.answers)?;
+    let truths = arguments.truth.as_deref().map(read).transpose()?;
+    LabelSet::parse(&answers, truths.as_deref())
+        .with_context(|| arguments.answers.display().to_string())
+        .map_err(Failure::usage)
 }
 
 /// Tables may be large, but are read whole; a byte order mark is left to the parser.
@@ -130,9 +134,14 @@ fn write(path: &Path, set: &LabelSet, decisions: &[ItemVerdict]) -> anyhow::Resu
     let mut writer = csv::Writer::from_path(path).with_context(cannot_write)?;
     writer.write_record(["item", "label", "probability", "truth"])?;
     for (item, decision) in set.items.iter().zip(decisions) {
-        let truth = item.truth.map_or("", |label| &set.labels[label]);
+        let label = |index: u32| set.labels[index as usize].as_str();
         let probability = format!("{:.4}", decision.probability);
-        writer.write_record([&item.name, &set.labels[decision.label], &probability, truth])?;
+        writer.write_record([
+            item.name.as_str(),
+            label(decision.label),
+            &probability,
+            item.truth.map_or("", label),
+        ])?;
     }
     writer.flush().with_context(cannot_write)
 }

@@ -3,13 +3,14 @@
 //! Each item is a landmark and each voter a vehicle. Votes do not become stale, and a voter's last answer
 //! about an item replaces earlier ones.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::vote::{MAX_LABELS, Vote, VoteConfig, WeightedConfig};
 use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
+use hashbrown::HashMap;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -23,9 +24,9 @@ const ROUND: Duration = Duration::from_millis(100);
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VoterAnswer {
     /// Index of the voter.
-    pub voter: usize,
+    pub voter: u32,
     /// Index of the label.
-    pub label: usize,
+    pub label: u32,
     /// Stated confidence, above 0 and up to 1.
     pub confidence: f64,
 }
@@ -34,11 +35,11 @@ pub struct VoterAnswer {
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabelledItem {
     /// Name in the file.
-    pub name: String,
+    pub name: Label,
     /// At most one answer of each voter.
     pub answers: Vec<VoterAnswer>,
     /// Index of the true label, if the file has one.
-    pub truth: Option<usize>,
+    pub truth: Option<u32>,
 }
 
 /// A label set that cannot be used.
@@ -90,9 +91,9 @@ pub struct LabelSet {
     /// In the order of the file.
     pub items: Vec<LabelledItem>,
     /// Names of the labels in alphabetical order.
-    pub labels: Vec<String>,
+    pub labels: Vec<Label>,
     /// Names of the voters in the order of the file.
-    pub voters: Vec<String>,
+    pub voters: Vec<Label>,
     /// Answers that a later answer of the same voter about the same item replaced.
     pub replaced: usize,
 }
@@ -101,7 +102,7 @@ pub struct LabelSet {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ItemVerdict {
     /// Index of the label.
-    pub label: usize,
+    pub label: u32,
     /// Probability of the label according to the method.
     pub probability: f64,
 }
@@ -115,8 +116,8 @@ pub struct VerdictScores {
     pub reliability: Reliability,
 }
 
-fn position(names: &mut HashMap<Label, usize>, name: &str) -> usize {
-    let next = names.len();
+fn position(names: &mut HashMap<Label, u32>, name: &str) -> u32 {
+    let next = names.len() as u32;
     *names.entry(name.into()).or_insert(next)
 }
 
@@ -153,7 +154,7 @@ impl LabelSet {
     /// Expected accuracy in percent of the most frequent label, of which one is drawn on a tie.
     pub fn majority_accuracy_pct(&self) -> f64 {
         let chance = |item: &LabelledItem| {
-            let mut votes: BTreeMap<usize, usize> = BTreeMap::new();
+            let mut votes: BTreeMap<u32, usize> = BTreeMap::new();
             for answer in &item.answers {
                 *votes.entry(answer.label).or_default() += 1;
             }
@@ -173,7 +174,9 @@ impl LabelSet {
         let mut order: Vec<usize> = (0..self.items.len()).collect();
         order.shuffle(&mut rng);
         let mut vote = Vote::new(self.vote_config(config), Vec::new());
-        let mut sequence = vec![0; self.voters.len()];
+        let voters: Vec<NodeName> = (0..self.voters.len()).map(voter_name).collect();
+        let labels: Vec<Label> = (0..self.labels.len()).map(label_name).collect();
+        let mut sequence = vec![0; voters.len()];
         let mut online = vec![
             ItemVerdict {
                 label: 0,
@@ -185,9 +188,19 @@ impl LabelSet {
             let now = START + ROUND * round;
             let mut answers = self.items[item].answers.clone();
             answers.shuffle(&mut rng);
+            let landmark = Label::from(item.to_string());
             for answer in answers {
-                sequence[answer.voter] += 1;
-                let report = report(item, answer, sequence[answer.voter], now);
+                let voter = answer.voter as usize;
+                sequence[voter] += 1;
+                let label = labels[answer.label as usize].clone();
+                let object = PerceivedObject {
+                    landmark: Some(landmark.clone()),
+                    ..PerceivedObject::new(label, answer.confidence, 0.0, 0.0)
+                };
+                let report = ObjectReport {
+                    objects: vec![object],
+                    ..ObjectReport::new(voters[voter].clone(), sequence[voter], now)
+                };
                 // The names and numbers are valid, and there is room for all of them.
                 let observed = vote.observe(&report, now);
                 debug_assert_eq!(observed, Ok(()));
@@ -195,7 +208,9 @@ impl LabelSet {
             take(vote.close(now).verdicts, &mut online);
         }
         let mut refined = online.clone();
-        take(vote.refine(passes), &mut refined);
+        if passes > 0 {
+            take(vote.refine(passes), &mut refined);
+        }
         [online, refined]
     }
 
@@ -235,26 +250,22 @@ impl LabelSet {
     }
 }
 
-/// A report of one answer. Names are numbers, so that any text in a file is a valid name.
+/// The name of a voter in reports: a number, so that any text in a file is valid.
 #[expect(clippy::expect_used, reason = "the name is valid for every number")]
-fn report(item: usize, answer: VoterAnswer, seq: u64, at: Timestamp) -> ObjectReport {
-    let label = format!("{:05}", answer.label);
-    let object = PerceivedObject {
-        landmark: Some(format!("{item}").as_str().into()),
-        ..PerceivedObject::new(label.as_str(), answer.confidence, 0.0, 0.0)
-    };
-    let name = NodeName::new(format!("voter-{}", answer.voter)).expect("letters and digits");
-    ObjectReport {
-        objects: vec![object],
-        ..ObjectReport::new(name, seq, at)
-    }
+fn voter_name(voter: usize) -> NodeName {
+    NodeName::new(format!("voter-{voter}")).expect("letters and digits")
 }
 
-/// Stores verdicts as decisions, by the numbers in the names of [`report`].
+/// The name of a label in reports: names sort as numbers.
+fn label_name(label: usize) -> Label {
+    format!("{label:05}").into()
+}
+
+/// Stores verdicts as decisions, by the numbers in the names of reports.
 fn take(verdicts: impl IntoIterator<Item = Verdict>, decisions: &mut [ItemVerdict]) {
     for verdict in verdicts {
         let item = verdict.landmark.as_str().parse::<usize>();
-        let label = verdict.label.as_deref().map(str::parse::<usize>);
+        let label = verdict.label.as_deref().map(str::parse::<u32>);
         if let (Ok(item), Some(Ok(label))) = (item, label) {
             let all: f64 = verdict.votes.values().sum();
             decisions[item] = ItemVerdict {
@@ -268,12 +279,13 @@ fn take(verdicts: impl IntoIterator<Item = Verdict>, decisions: &mut [ItemVerdic
 /// A label set while it is read: names have numbers in the order of the file.
 #[derive(Default)]
 struct LabelSetReader {
-    items: HashMap<Label, usize>,
-    voters: HashMap<Label, usize>,
-    labels: HashMap<Label, usize>,
+    items: HashMap<Label, u32>,
+    voters: HashMap<Label, u32>,
+    labels: HashMap<Label, u32>,
     /// By item, in the order of the file.
     answers: Vec<Vec<VoterAnswer>>,
-    truths: HashMap<usize, usize>,
+    /// By item.
+    truths: HashMap<u32, u32>,
 }
 
 impl LabelSetReader {
@@ -315,7 +327,7 @@ impl LabelSetReader {
                 label,
                 confidence,
             };
-            self.answers[item].push(answer);
+            self.answers[item as usize].push(answer);
             let truth = truth_column.and_then(|column| row.get(column));
             if let Some(truth) = truth.filter(|truth| !truth.is_empty()) {
                 self.add_truth(line, item, item_name, truth)?;
@@ -347,7 +359,7 @@ impl LabelSetReader {
     fn add_truth(
         &mut self,
         line: u64,
-        item: usize,
+        item: u32,
         name: &str,
         truth: &str,
     ) -> Result<(), LabelSetError> {
@@ -366,48 +378,43 @@ impl LabelSetReader {
         if self.labels.len() > MAX_LABELS {
             return Err(LabelSetError::TooManyLabels(self.labels.len()));
         }
-        let sorted: BTreeSet<&Label> = self.labels.keys().collect();
-        let mut number = vec![0; self.labels.len()];
-        for (place, name) in sorted.iter().enumerate() {
-            number[self.labels[*name]] = place;
+        let labels: BTreeSet<&Label> = self.labels.keys().collect();
+        let mut number = vec![0; labels.len()];
+        for (place, name) in (0..).zip(&labels) {
+            number[self.labels[*name] as usize] = place;
         }
-        let labels = sorted.into_iter().map(ToString::to_string).collect();
-        let mut stated = self.answers;
+        let labels = labels.into_iter().cloned().collect();
         let mut replaced = 0;
-        let item = |(name, index): (&str, usize)| {
-            let all = std::mem::take(&mut stated[index]);
+        let item = |((index, name), all): ((u32, Label), Vec<VoterAnswer>)| {
             let before = all.len();
             let mut answers = last_answers(all);
             replaced += before - answers.len();
             for answer in &mut answers {
-                answer.label = number[answer.label];
+                answer.label = number[answer.label as usize];
             }
+            let truth = self.truths.get(&index);
             LabelledItem {
-                name: name.to_owned(),
+                name,
                 answers,
-                truth: self.truths.get(&index).map(|label| number[*label]),
+                truth: truth.map(|label| number[*label as usize]),
             }
         };
-        let items = in_order(&self.items).map(item).collect();
+        let names = (0..).zip(in_order(self.items));
+        let items = names.zip(self.answers).map(item).collect();
         Ok(LabelSet {
             items,
             labels,
-            voters: in_order(&self.voters)
-                .map(|(name, _)| name.to_owned())
-                .collect(),
+            voters: in_order(self.voters),
             replaced,
         })
     }
 }
 
-/// Names with their numbers, in the order of the numbers.
-fn in_order(names: &HashMap<Label, usize>) -> impl Iterator<Item = (&str, usize)> {
-    let mut sorted: Vec<(&str, usize)> = names
-        .iter()
-        .map(|(name, number)| (name.as_str(), *number))
-        .collect();
+/// Names in the order of their numbers.
+fn in_order(names: HashMap<Label, u32>) -> Vec<Label> {
+    let mut sorted: Vec<_> = names.into_iter().collect();
     sorted.sort_unstable_by_key(|(_, number)| *number);
-    sorted.into_iter()
+    sorted.into_iter().map(|(name, _)| name).collect()
 }
 
 #[expect(
@@ -508,7 +515,7 @@ mod tests {
         let set = LabelSet::parse("item,voter,label\nx,a,cup\nx,a,mouse\n", None).unwrap();
         assert_eq!(set.replaced, 1);
         let label = set.items[0].answers[0].label;
-        assert_eq!((set.answers(), set.labels[label].as_str()), (1, "mouse"));
+        assert_eq!((set.answers(), &*set.labels[label as usize]), (1, "mouse"));
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //! arrival.
 
 use super::WeightedVoting;
+use crate::model::names::NodeName;
 use crate::vote::calibration::ConfidenceCalibration;
 use crate::vote::dependence::Dependence;
 use crate::vote::label_bias::LabelBias;
@@ -13,11 +14,12 @@ impl WeightedVoting {
         let mut dependence = Dependence::of_stored();
         let mut label_bias = LabelBias::new(f64::INFINITY);
         let mut calibration = ConfidenceCalibration::new(self.config.calibration_votes);
+        let mut vehicles: Vec<(&NodeName, &usize)> = self.vehicles.iter().collect();
+        vehicles.sort_unstable();
         let mut by_name = vec![0; self.names.len()];
-        self.vehicles
-            .values()
-            .enumerate()
-            .for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
+        for (rank, (_, vehicle)) in vehicles.into_iter().enumerate() {
+            by_name[*vehicle] = rank;
+        }
         for landmark in self.landmarks.by_name() {
             let landmark_votes = self.landmarks.votes_mut(landmark);
             landmark_votes
@@ -87,10 +89,7 @@ impl WeightedVoting {
             landmark_votes.published = None;
             landmark_votes.counted = true;
             landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
-            landmark_votes
-                .votes
-                .iter_mut()
-                .for_each(|vote| vote.agreement = None);
+            landmark_votes.agreements_counted = false;
             landmark_votes.posterior = landmark_votes.majority();
             self.model.add_live(
                 &landmark_votes.weighted_votes(),

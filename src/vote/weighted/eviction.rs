@@ -7,7 +7,7 @@ use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::Counts;
 use crate::vote::dawid_skene::VehicleEvidence;
-use crate::vote::label_map::LabelIndex;
+use crate::vote::index_map::LabelIndex;
 
 impl WeightedVoting {
     /// Removes vehicles with their votes and the evidence about them; other vehicles reuse their
@@ -67,11 +67,15 @@ impl WeightedVoting {
         for landmark in self.landmarks_where(is_affected) {
             // Without settling: the other votes would become evidence more often than by their age.
             self.remove_live(landmark);
-            dropped += self.landmarks.votes_mut(landmark).remove_labels(is_gone);
+            for vehicle in self.landmarks.votes_mut(landmark).remove_labels(is_gone) {
+                self.stored[vehicle] -= 1;
+                dropped += 1;
+            }
             self.changed.insert(landmark);
         }
-        for vote in self.landmarks.iter_mut().flat_map(|l| &mut l.votes) {
-            vote.recent.remove_labels(is_gone);
+        let votes = self.landmarks.iter_mut().flat_map(|l| &mut l.votes);
+        for recent in votes.filter_map(|vote| vote.recent.as_deref_mut()) {
+            recent.remove_labels(is_gone);
         }
         self.model.remove_labels(&gone);
         self.dependence.remove_labels(&gone);

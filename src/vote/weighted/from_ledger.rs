@@ -8,8 +8,8 @@ use crate::model::names::{Label, NodeName};
 use crate::reputation::{RememberedVotes, ReputationLedger};
 use crate::vote::config::VoteConfig;
 use crate::vote::confusion::Confusion;
+use crate::vote::index_map::LabelIndex;
 use crate::vote::label_bias::LabelRecord;
-use crate::vote::label_map::LabelIndex;
 
 impl WeightedVoting {
     /// Takes over the ledger's kept votes except those that were counted here: a standby has

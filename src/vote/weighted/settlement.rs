@@ -43,7 +43,9 @@ impl WeightedVoting {
         }
         self.settle_votes(landmark);
         let landmark_votes = self.landmarks.votes_mut(landmark);
-        landmark_votes.votes.retain(|vote| !is_past(vote));
+        for vote in landmark_votes.votes.extract_if(.., |vote| is_past(vote)) {
+            self.stored[vote.vehicle] -= 1;
+        }
         if landmark_votes.votes.is_empty() {
             landmark_votes.published = None;
             landmark_votes.posterior.clear();
@@ -59,9 +61,9 @@ impl WeightedVoting {
                 &landmark_votes.posterior,
                 -1.0,
             );
-            for vote in &mut landmark_votes.votes {
-                if let Some(agreement) = vote.agreement.take() {
-                    self.calibration.count(vote.band, agreement, -1.0);
+            if std::mem::take(&mut landmark_votes.agreements_counted) {
+                for vote in &landmark_votes.votes {
+                    self.calibration.count(vote.band, vote.agreement, -1.0);
                 }
             }
         }
@@ -82,7 +84,7 @@ impl WeightedVoting {
             let settled: Vec<_> = judged
                 .map(|vote| {
                     (
-                        *vote,
+                        vote,
                         self.model
                             .leave_one_out(&landmark_votes.posterior, &vote.weighted()),
                     )

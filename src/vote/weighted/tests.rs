@@ -61,3 +61,37 @@ fn votes_expire_on_time() {
     }
     assert!(voting.expiries.is_empty());
 }
+
+#[test]
+fn stored_votes_are_counted_by_vehicle() {
+    let mut voting = voting(2.0);
+    let assert_counted = |voting: &WeightedVoting| {
+        let mut stored = vec![0; voting.names.len()];
+        for landmark in voting.landmarks.following(None) {
+            for vote in &voting.landmarks.votes(landmark).votes {
+                stored[vote.vehicle] += 1;
+            }
+        }
+        assert_eq!(voting.stored, stored);
+        stored.iter().sum::<usize>()
+    };
+    for (landmark, node, ms) in [
+        ("x", "a", 0),
+        ("x", "b", 100),
+        ("x", "a", 200),
+        ("y", "a", 1000),
+        ("z", "c", 1500),
+        ("z", "b", 1600),
+    ] {
+        add_vote(&mut voting, landmark, node, ms);
+    }
+    assert_eq!(assert_counted(&voting), 5);
+    voting.close(START + Duration::from_millis(2150));
+    assert_eq!(assert_counted(&voting), 4, "an expired vote");
+    voting.remove_landmark(&"y".into());
+    assert_eq!(assert_counted(&voting), 3);
+    voting.remove_vehicles(&[NodeName::new("c").unwrap()].into());
+    assert_eq!(assert_counted(&voting), 2);
+    assert_eq!(voting.evict_labels_for(&"mouse".into(), 1), 2);
+    assert_eq!(assert_counted(&voting), 0);
+}
