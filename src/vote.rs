@@ -111,7 +111,7 @@ pub struct Vote {
     config: VoteConfig,
     /// Whether landmarks are taken from the reports.
     open: bool,
-    /// Listed landmarks; none in an open cell.
+    /// Listed landmarks; empty in an open cell.
     landmarks: BTreeMap<LandmarkId, Landmark>,
     /// Landmarks of an open cell.
     named: NamedLandmarks,

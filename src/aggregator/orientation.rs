@@ -11,7 +11,7 @@
 //! Streets and rows of parked cars look alike after half a turn or a mirror, so that observers with
 //! separate views might coincide by chance. A change therefore counts only if no other change, and
 //! no shift of the same change, explains half as many objects, and if three windows agree. Two
-//! other vehicles must have reported explained objects; the only one that reports objects there
+//! other vehicles must have reported explained objects; a sole other vehicle with objects there
 //! suffices if the change is about the observer's own position.
 
 mod comparison;

@@ -44,7 +44,7 @@ impl<I: Copy + Ord, V> IndexMap<I, V> {
         Some(&self.values[place])
     }
 
-    /// The value of an index, which is added if the index has none.
+    /// The value of an index; a missing one is added.
     pub(super) fn entry(&mut self, index: I) -> &mut V
     where
         V: Default,

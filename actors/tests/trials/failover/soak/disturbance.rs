@@ -158,7 +158,7 @@ impl Disturbance {
             | Kind::OneWay => trouble.kind == "node_missing" && is_struck,
             Kind::Flood => is_intruder && is_one_of(&FLOOD_TROUBLES),
             Kind::BadInput => is_intruder && is_one_of(&JUNK_TROUBLES),
-            // Reports wait until TCP has repeated what was lost.
+            // Reports wait until TCP has sent the lost packets again.
             Kind::Loss => trouble.kind == "untimely",
             Kind::Busy => false,
         }
