@@ -135,10 +135,13 @@ impl RoundFilter {
         self.check_origin(&epoch, origin)?;
         self.maps
             .admit(&epoch, map.round, received_at, leadership)?;
-        if !self.map_age.is_fresh(&epoch, map.fused_at_us, received_at) {
-            self.maps.on_stale();
-            return Err(Refusal::Stale);
-        }
+        check_age(
+            &mut self.maps,
+            &mut self.map_age,
+            &epoch,
+            map.fused_at_us,
+            received_at,
+        )?;
         self.record_origin(&epoch, origin);
         self.map_accepted_at = Some(received_at);
         Ok(accepted(epoch, map.round, true, leadership))
@@ -159,13 +162,13 @@ impl RoundFilter {
         self.check_origin(&epoch, origin)?;
         self.verdicts
             .admit(&epoch, verdicts.round, received_at, leadership)?;
-        if !self
-            .verdict_age
-            .is_fresh(&epoch, verdicts.fused_at_us, received_at)
-        {
-            self.verdicts.on_stale();
-            return Err(Refusal::Stale);
-        }
+        check_age(
+            &mut self.verdicts,
+            &mut self.verdict_age,
+            &epoch,
+            verdicts.fused_at_us,
+            received_at,
+        )?;
         self.record_origin(&epoch, origin);
         let is_sign_of_life = self
             .map_accepted_at
@@ -217,6 +220,23 @@ impl RoundFilter {
 /// stopped. The saved term is one higher, because a node writes the next term to disk in advance.
 fn floor(saved_term: u64) -> u64 {
     saved_term.saturating_sub(1)
+}
+
+/// Refuses an admitted round that was in transit for too long by its time of fusion; see
+/// [`StalenessFilter`].
+fn check_age(
+    order: &mut SuccessionFilter,
+    age: &mut StalenessFilter,
+    epoch: &Epoch,
+    fused_at: Timestamp,
+    received_at: Timestamp,
+) -> Result<(), Refusal> {
+    if age.is_fresh(epoch, fused_at, received_at) {
+        Ok(())
+    } else {
+        order.on_stale();
+        Err(Refusal::Stale)
+    }
 }
 
 /// The accepted round, with the facts that its receivers need beside the message.
@@ -315,6 +335,8 @@ mod tests {
                 let map = map(7, round, at(round));
                 let waited = take(&mut filter, &map, at(resumed), &seeking);
                 assert_eq!(waited, Err(Refusal::Stale), "round {round}");
+                let again = take(&mut filter, &map, at(resumed), &seeking);
+                assert_eq!(again, Err(Refusal::Repeated), "round {round}");
             }
             let map = map(7, newest, at(newest));
             assert_eq!(take(&mut filter, &map, at(resumed), &seeking), Ok(()));

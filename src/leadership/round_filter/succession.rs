@@ -35,10 +35,12 @@ pub struct SuccessionFilter {
     /// True if the topic's last message is retained. In this case any term is accepted while there
     /// is no leader, and the first message may have any age.
     is_retained: bool,
-    /// Arrival of the last admitted message that was not stale; before any, of the first message.
+    /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
-    /// The same before the newest admitted message.
-    before_newest_at: Option<Timestamp>,
+    /// Arrival of the last admitted message that was not stale; before any, of the first message.
+    fresh_at: Option<Timestamp>,
+    /// `fresh_at` without the last admitted message, which may prove stale.
+    earlier_fresh_at: Option<Timestamp>,
     /// True if the only admitted message may have been retained, and be of any age.
     newest_is_retained: bool,
     elected: Option<Elected>,
@@ -89,7 +91,8 @@ impl SuccessionFilter {
             gate: EpochGate::new(floor),
             is_retained: false,
             newest_at: None,
-            before_newest_at: None,
+            fresh_at: None,
+            earlier_fresh_at: None,
             newest_is_retained: false,
             elected: None,
             others_since: None,
@@ -147,10 +150,10 @@ impl SuccessionFilter {
         }
     }
 
-    /// The round that was just admitted had waited in a queue: its arrival does not show how many
-    /// rounds the leader has published since.
-    pub fn on_stale(&mut self) {
-        self.newest_at = self.before_newest_at;
+    /// Processes that the message that [`Self::admit`] has just admitted is stale. It waited in a
+    /// queue, and the leader may have published many rounds meanwhile.
+    pub(super) fn on_stale(&mut self) {
+        self.fresh_at = self.earlier_fresh_at;
     }
 
     /// True if an unconfirmed epoch must not be accepted yet.
@@ -284,9 +287,10 @@ impl SuccessionFilter {
         let is_first = self.gate.latest().is_none();
         let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
         let quiet = silence >= EPOCH_MEMORY;
+        let fresh_at = *self.fresh_at.get_or_insert(received_at);
         let limit = |last: u64| {
             last.saturating_add(MAX_ROUNDS_AHEAD)
-                .saturating_add(max_rounds_in(silence))
+                .saturating_add(max_rounds_in(received_at.since(fresh_at)))
         };
         if !quiet
             && !self.newest_is_retained
@@ -306,7 +310,8 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        self.before_newest_at = self.newest_at.replace(received_at);
+        self.newest_at = Some(received_at);
+        self.earlier_fresh_at = self.fresh_at.replace(received_at);
         self.newest_is_retained = is_first && self.is_retained;
         Ok(())
     }
