@@ -269,27 +269,29 @@ impl ComparedReport {
     /// True if the explained objects are objects of two other vehicles. One vehicle against another
     /// shows only that they differ: a change about a point that both share would explain the right
     /// one, too. A change about the observer's own position needs only one other vehicle, if that
-    /// stands elsewhere and no further vehicle reports objects there.
+    /// stands elsewhere and no further vehicle has objects near the explained ones or near those
+    /// that the observer reports.
     fn is_witnessed(&self, misreading: &Misreading) -> bool {
         let images: Vec<_> = self.coinciding(misreading, None).collect();
         let centre = mean(&images);
         let around_m = 2.0 * root_mean_square_m(&images);
+        let present_m = PRESENT_GATES * self.gate_m;
         let mut coinciding = [0; u32::BITS as usize];
-        let mut around = 0;
+        let mut concerned = 0;
         let mut only: Option<Pose> = None;
         for reference in &self.references {
-            let Some(change) = misreading.change_of_other(reference.observer.as_ref()) else {
-                continue;
-            };
-            let position = change.apply(&reference.position);
-            if nalgebra::distance(&position, &centre) > around_m {
-                continue;
-            }
-            around |= reference.witnesses;
-            only = only.or(reference.observer);
-            let coincides = is_near(&position, &images, self.gate_m);
+            let change = misreading.change_of_other(reference.observer.as_ref());
+            let position = change.map(|change| change.apply(&reference.position));
+            let coincides =
+                position.is_some_and(|position| is_near(&position, &images, self.gate_m));
             for (number, objects) in coinciding.iter_mut().enumerate() {
                 *objects += u32::from(coincides) & reference.witnesses >> number;
+            }
+            let is_around =
+                position.is_some_and(|position| nalgebra::distance(&position, &centre) <= around_m);
+            if is_around || is_near(&reference.position, &self.objects, present_m) {
+                concerned |= reference.witnesses;
+                only = only.or(reference.observer);
             }
         }
         let witnesses = coinciding
@@ -299,7 +301,8 @@ impl ComparedReport {
         let stands_elsewhere = only.zip(self.pose).is_some_and(|(only, own)| {
             nalgebra::distance(&only.position, &own.position) >= MIN_APART_GATES * self.gate_m
         });
-        witnesses >= 2 || !misreading.is_of_frame() && around.count_ones() == 1 && stands_elsewhere
+        let is_sole = concerned.count_ones() == 1 && self.references.len() < MAX_REFERENCES;
+        witnesses >= 2 || !misreading.is_of_frame() && is_sole && stands_elsewhere
     }
 
     /// Images of the objects that coincide after the change and a shift in gates.
