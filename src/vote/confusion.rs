@@ -169,9 +169,15 @@ impl Confusion {
 
     /// Labels with the number of votes for them where they were true.
     pub(super) fn diagonal(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
-        self.iter()
-            .filter(|(stated, truth, _)| stated == truth)
-            .map(|(label, _, votes)| (label, self.scale * votes.max(0.0)))
+        let columns = self.table.chunks(self.labels.max(1)).skip(1);
+        let placed = (0..).zip(columns.enumerate().map(|(row, column)| column[row]));
+        let others = self.others.columns.iter().map(|(label, column)| {
+            let right = column.get(label).copied().unwrap_or_default();
+            (label, right)
+        });
+        placed
+            .chain(others)
+            .map(|(label, right)| (label, self.scale * right.max(0.0)))
     }
 
     /// Number of right votes.

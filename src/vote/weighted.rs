@@ -157,7 +157,7 @@ impl WeightedVoting {
     fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<usize>) {
         let mut budget =
             (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
-        // `None` is the end of the names.
+        // `None` stands for the start of another turn.
         let mut visits: Vec<Option<usize>> = Vec::new();
         let rest = self.landmarks.following(self.revisit_after.as_ref());
         let all = self.landmarks.following(None);
