@@ -385,7 +385,8 @@ impl LabelSetReader {
         }
         let labels = labels.into_iter().cloned().collect();
         let mut replaced = 0;
-        let item = |((index, name), all): ((u32, Label), Vec<VoterAnswer>)| {
+        let mut items = Vec::with_capacity(self.answers.len());
+        for (index, (name, all)) in (0..).zip(in_order(self.items).into_iter().zip(self.answers)) {
             let before = all.len();
             let mut answers = last_answers(all);
             replaced += before - answers.len();
@@ -393,14 +394,12 @@ impl LabelSetReader {
                 answer.label = number[answer.label as usize];
             }
             let truth = self.truths.get(&index);
-            LabelledItem {
+            items.push(LabelledItem {
                 name,
                 answers,
                 truth: truth.map(|label| number[*label as usize]),
-            }
-        };
-        let names = (0..).zip(in_order(self.items));
-        let items = names.zip(self.answers).map(item).collect();
+            });
+        }
         Ok(LabelSet {
             items,
             labels,
