@@ -85,7 +85,7 @@ async fn cell_survives_region_outage() {
     }
 }
 
-/// How long the broker hangs: shorter than the link's keep-alive. A link that is lost takes the maps with it.
+/// How long the broker hangs: shorter than the link's keep-alive. A lost link would also drop the queued maps.
 const HANG: Duration = Duration::from_secs(4);
 
 /// A broker that hangs receives few maps, and the maps that it forwards afterwards are too old for all receivers.

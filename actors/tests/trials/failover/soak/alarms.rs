@@ -21,6 +21,7 @@ pub(super) struct Alarm {
 }
 
 /// Judges troubles by node. A trouble is right if the fault of its minute explains it, or the fault of the minute before.
+/// A trouble before the first fault is wrong.
 pub(super) fn judge(
     troubles: &BTreeMap<NodeName, Vec<LoggedTrouble>>,
     minutes: &[Minute],

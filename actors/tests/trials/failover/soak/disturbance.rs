@@ -98,7 +98,8 @@ impl Disturbance {
             }
             Kind::KillLeaderAndStandby => {
                 struck.push(cell.leader()?);
-                struck.extend(cell.standby());
+                // A leader without a standby is killed alone.
+                struck.extend(cell.standby().ok());
                 kill(cell, &struck, lasts).await?;
             }
             Kind::KillVehicles => {
@@ -146,6 +147,7 @@ impl Disturbance {
     pub(super) fn explains(self, trouble: &LoggedTrouble, struck: &BTreeSet<NodeName>) -> bool {
         let about = trouble.about.as_deref();
         let is_struck = struck.iter().any(|node| Some(node.as_str()) == about);
+        // A broker names clients without a certificate by their address; the intruder is the sole such client.
         let is_intruder =
             about.is_some_and(|about| about == intruder::NAME || about.ends_with(", programs"));
         let is_one_of = |kinds: &[&str]| kinds.contains(&&*trouble.kind);
