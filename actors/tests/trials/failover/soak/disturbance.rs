@@ -156,8 +156,9 @@ impl Disturbance {
             | Kind::KillLeaderAndStandby
             | Kind::KillVehicles
             | Kind::PauseEdge
-            | Kind::Split
-            | Kind::OneWay => trouble.kind == "node_missing" && is_struck,
+            | Kind::Split => trouble.kind == "node_missing" && is_struck,
+            // The vehicle's own messages arrive, but logins at the edge's broker fail.
+            Kind::OneWay => is_one_of(&["node_missing", "broker_unreachable"]) && is_struck,
             Kind::Flood => is_intruder && is_one_of(&FLOOD_TROUBLES),
             Kind::BadInput => is_intruder && is_one_of(&JUNK_TROUBLES),
             // Reports wait until TCP has sent the lost packets again.
