@@ -115,7 +115,7 @@ pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
 pub(crate) struct LoggedTrouble {
     pub(crate) at: Timestamp,
     pub(crate) kind: String,
-    /// What the trouble is about; `None` for the node itself.
+    /// Subject of the trouble; `None` for the node itself.
     pub(crate) about: Option<String>,
     pub(crate) cause: String,
 }
