@@ -10,7 +10,6 @@ pub mod fuzzing;
 pub(crate) mod handshake;
 pub(crate) mod key;
 pub(crate) mod machine;
-pub(crate) mod near_cells;
 pub(crate) mod node_id;
 pub(crate) mod notices;
 pub(crate) mod replay_window;

@@ -195,12 +195,11 @@ impl GossipMachine {
             return;
         }
         let gossip = &self.gossip;
-        let is_alone = gossip.alive().is_empty();
         let arrival = Arrival {
             from,
             now: at,
             own: gossip.own(),
-            is_alone,
+            is_alone: self.unanswered >= ALONE_HELLOS,
             known: &|name| gossip.known(name),
         };
         let taken = match self.sessions.open(datagram, &arrival) {
@@ -559,7 +558,7 @@ impl GossipMachine {
         };
         if self.unanswered <= 1 {
             self.answered.clear();
-        } else if self.unanswered.is_multiple_of(SILENT_SEED_HELLOS) {
+        } else if self.unanswered.is_multiple_of(ALONE_HELLOS) {
             let silent = self
                 .seeds
                 .iter()
@@ -685,9 +684,9 @@ const SESSION_TIMEOUT: Duration = Duration::from_millis(200);
 const MAX_PENDING: usize = 64;
 const MAX_PENDING_FRAMES: usize = 4;
 
-/// Number of unanswered greetings, equivalent to ten seconds by default, after which silent seeds
-/// are reported, repeatedly.
-const SILENT_SEED_HELLOS: u32 = 20;
+/// Number of greetings without another node, equivalent to ten seconds by default, after which a
+/// node is alone: it reports silent seeds, repeatedly, and other cells.
+const ALONE_HELLOS: u32 = 20;
 
 /// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
 const MULTICAST_EVERY: u64 = 10;

@@ -31,7 +31,6 @@ use super::handshake::{Identity, Proven, Prover};
 use super::key::{
     BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of,
 };
-use super::near_cells::{NearCells, are_numbered};
 use super::node_id::NodeId;
 use super::notices::{GossipNotice, Notices};
 use super::reply_throttle::ReplyThrottle;
@@ -56,7 +55,6 @@ pub(crate) struct Sessions {
     verifications: ReplyThrottle,
     greetings: TokenBucket,
     cell: NodeName,
-    near_cells: NearCells,
     notices: Notices,
     counters: Arc<FrameCounters>,
 }
@@ -90,7 +88,7 @@ pub(crate) struct Arrival<'a> {
     pub(crate) from: SocketAddr,
     pub(crate) now: Timestamp,
     pub(crate) own: &'a NodeId,
-    /// True if this node has not found another node.
+    /// True if this node has been greeting for about ten seconds and has not found another node.
     pub(crate) is_alone: bool,
     /// State of a name in this node's gossip.
     pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
@@ -165,7 +163,6 @@ impl Sessions {
             verifications: ReplyThrottle::new(now),
             greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
             cell,
-            near_cells: NearCells::default(),
             notices: Notices::default(),
             counters,
         }
@@ -307,7 +304,7 @@ impl Sessions {
     ) -> Result<FrameContent, FrameEvent> {
         let head = FrameHeader::read(frame, self.key.tag()).inspect_err(|reason| {
             if *reason == FrameEvent::WrongCell {
-                self.record_other_cell(frame, arrival);
+                self.record_other_cell(arrival);
             }
         })?;
         if head.version != self.version() {
@@ -418,18 +415,12 @@ impl Sessions {
         self.notices.add(&from.ip(), TroubleKind::WrongKey, cause);
     }
 
-    /// Records a cell with a similar name. Numbered cells may be neighbours, unless this node has
-    /// found no other node.
-    fn record_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
-        let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else {
-            return;
-        };
-        let Some(other) = self.near_cells.name_of(tag, &self.cell) else {
-            return;
-        };
-        if !are_numbered(other, &self.cell) || arrival.is_alone {
+    /// Records a datagram of another cell at a node that finds no other node: the names of the cells
+    /// may be meant to be equal. The datagram identifies its cell only by a hash.
+    fn record_other_cell(&mut self, arrival: &Arrival<'_>) {
+        if arrival.is_alone {
             let cause = format!(
-                "received a datagram of cell {other} from {}; this node is in {}",
+                "received a datagram of another cell from {}; this node is in {} and finds no other node",
                 arrival.from.ip(),
                 self.cell
             );
