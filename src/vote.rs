@@ -29,6 +29,7 @@ mod likelihood;
 mod method;
 mod named_landmarks;
 mod paper;
+mod parameters;
 mod visibility;
 mod weighted;
 

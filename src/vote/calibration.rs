@@ -3,21 +3,12 @@
 
 use std::collections::BTreeSet;
 
-/// Number of rank bands of a vehicle's confidences.
-const BANDS: usize = 10;
+use super::parameters::{
+    BAND_NOISE, BAND_PRIOR_VOTES, BANDS, CONFIDENCE_WEIGHTS, LONG_MEMORY_VOTES, RANK_PRIOR_VOTES,
+};
+
 /// Bins of the histogram of a vehicle's confidences.
 const BINS: usize = 20;
-/// Weight, in votes, of the middle rank against a vehicle's own confidences.
-const RANK_PRIOR_VOTES: f64 = 5.0;
-/// Weight, in votes, of the overall rate of agreement against a band's own.
-const BAND_PRIOR_VOTES: f64 = 100.0;
-/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the
-/// chance spread of ten equal bands, 1/2 + … + 1/10 (Barlow et al. 1972).
-const NOISE: f64 = 6.0;
-/// Votes over which settled agreement fades to 1/e.
-const MEMORY_VOTES: f64 = 20_000.0;
-/// Least and greatest weight of a vote for its confidence.
-const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
 /// Index of a band.
 pub(super) type Band = u8;
@@ -129,7 +120,7 @@ impl ConfidenceCalibration {
 
     /// Counts a settled vote.
     pub(super) fn settle(&mut self, band: Band, agreement: f64) {
-        self.settled.fade(1.0 - 1.0 / MEMORY_VOTES);
+        self.settled.fade(1.0 - 1.0 / LONG_MEMORY_VOTES);
         self.settled.add(band, agreement, 1.0);
     }
 
@@ -164,7 +155,8 @@ impl ConfidenceCalibration {
             let kept = shrinkage(&pools);
             for (agreed, votes, width) in pools {
                 let ratio = 1.0 + kept * (shrunk(agreed, votes) / overall - 1.0);
-                ratios[band..band + width].fill(ratio.clamp(WEIGHT_RANGE.0, WEIGHT_RANGE.1));
+                ratios[band..band + width]
+                    .fill(ratio.clamp(CONFIDENCE_WEIGHTS.0, CONFIDENCE_WEIGHTS.1));
                 band += width;
             }
         }
@@ -205,7 +197,7 @@ fn shrinkage(pools: &[(f64, f64, usize)]) -> f64 {
     let spread: f64 = with_votes()
         .map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2))
         .sum();
-    let noise = NOISE * rate * (1.0 - rate);
+    let noise = BAND_NOISE * rate * (1.0 - rate);
     if spread > noise {
         1.0 - noise / spread
     } else {
@@ -235,7 +227,7 @@ impl Weights {
     /// Weight of a vote of the stated confidence; 1 when all votes have the same confidence.
     pub(super) fn of(&self, band: Band, confidence: f64) -> f64 {
         let n = self.votes;
-        let (low, high) = WEIGHT_RANGE;
+        let (low, high) = CONFIDENCE_WEIGHTS;
         let stated = if self.mean > 0.0 {
             (confidence / self.mean).clamp(low, high)
         } else {

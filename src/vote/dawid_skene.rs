@@ -21,6 +21,7 @@ use super::label_bias::LabelBias;
 use super::likelihood::{
     LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability,
 };
+use super::parameters::{FLEET_PRIOR_VOTES, KEPT_AFTER_ALARM, SHORTFALL_ALARM, SHORTFALL_SLACK};
 
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
@@ -151,16 +152,6 @@ impl ClassShares {
         (self.equal_part * equal + (1.0 - self.equal_part) * share).ln()
     }
 }
-
-/// Weight, in votes, of the assumed accuracy against the fleet's record.
-const FLEET_PRIOR_VOTES: f64 = 1.0;
-/// Drop in the rate of right votes that is tolerated.
-const SHORTFALL_SLACK: f64 = 0.2;
-/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with
-/// 80 % right ones.
-const SHORTFALL_ALARM: f64 = 4.0;
-/// Part of a vehicle's past that still counts after a change.
-const KEPT_AFTER_ALARM: f64 = 0.1;
 
 impl DawidSkene {
     pub(super) fn new(config: WeightedConfig) -> Self {

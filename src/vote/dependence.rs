@@ -15,33 +15,10 @@
 use std::collections::BTreeSet;
 
 use super::index_map::{IndexMap, LabelIndex};
-
-/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost
-/// of a vote.
-const MAX_COMPARED: usize = 8;
-/// The same distance for stored votes.
-const MAX_COMPARED_STORED: usize = 32;
-/// Standard deviations by which agreement must exceed the expected agreement.
-const SIGNIFICANCE: f64 = 4.0;
-/// The same threshold for stored votes, where many pairs are tested at once: one in 3 million
-/// exceeds it by chance.
-const SIGNIFICANCE_STORED: f64 = 5.0;
-/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more
-/// influence.
-const SAME_GROUP: f64 = 0.3;
-/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as
-/// reliable as others.
-const PRIOR_COMPARISONS: f64 = 10.0;
-/// Votes after which a vehicle has half of its final influence on the choice of the main group;
-/// bounds the gain of attackers who rejoin under new names.
-const TENURE_VOTES: f64 = 50.0;
-/// Support of a vehicle for itself; without it, the supports of two vehicles that agree against a
-/// third would be 0.
-const SELF_SUPPORT: f64 = 0.01;
-const GROUPING_STEPS: u32 = 30;
-const FACTOR_STEPS: u32 = 15;
-/// Comparisons after which the counts of stated labels are halved.
-const SHARES_MEMORY: f64 = 10_000.0;
+use super::parameters::{
+    ITERATIONS, LONG_MEMORY_VOTES, MAX_COMPARED, PRIOR_COMPARISONS, SAME_GROUP, SELF_SUPPORT,
+    SIGNIFICANCE, TENURE_VOTES,
+};
 
 /// A vote that is compared with the other votes on its landmark.
 #[derive(Debug, Clone, Copy)]
@@ -67,10 +44,10 @@ impl Pair {
     }
 
     /// The dependent part ρ of a vote, where κ = `explained` is expected of independent vehicles.
-    fn excess(&self, explained: f64, significance: f64) -> f64 {
+    fn excess(&self, explained: f64) -> f64 {
         let expected = self.chance + (self.compared - self.chance) * explained;
         let deviation = (expected * (1.0 - expected / self.compared).max(0.0) + 1.0).sqrt();
-        if self.agreed - expected > significance * deviation {
+        if self.agreed - expected > SIGNIFICANCE * deviation {
             ((self.kappa() - explained) / (1.0 - explained)).clamp(0.0, 1.0)
         } else {
             0.0
@@ -123,8 +100,6 @@ pub(super) struct AgreementGroups {
 pub(super) struct Dependence {
     /// Comparisons over which a pair's counts fade to 1/e.
     memory: f64,
-    max_compared: usize,
-    significance: f64,
     pairs: Pairs,
     /// Number of pairs.
     known: usize,
@@ -145,26 +120,12 @@ impl Dependence {
     pub(super) fn new(memory: f64) -> Self {
         Self {
             memory,
-            max_compared: MAX_COMPARED,
-            significance: SIGNIFICANCE,
             ..Self::default()
         }
     }
 
     pub(super) fn configure(&mut self, memory: f64) {
         self.memory = memory;
-    }
-
-    /// As [`Self::new`], for all stored votes together, without fading.
-    pub(super) fn of_stored() -> Self {
-        let max_compared = MAX_COMPARED_STORED;
-        let significance = SIGNIFICANCE_STORED;
-        Self {
-            memory: f64::INFINITY,
-            max_compared,
-            significance,
-            ..Self::default()
-        }
     }
 
     /// Removes vehicles, whose indices may be reused.
@@ -206,7 +167,7 @@ impl Dependence {
             self.tenure[vote.vehicle] += f64::from(vote.is_new);
         }
         let distances = votes.len() / 2;
-        for step in 0..distances.min(self.max_compared) {
+        for step in 0..distances.min(MAX_COMPARED) {
             let distance = 1 + (self.compared / votes.len() + step) % distances;
             let half_turn = 2 * distance == votes.len();
             for place in 0..if half_turn { distance } else { votes.len() } {
@@ -234,14 +195,14 @@ impl Dependence {
         self.compared += 1;
     }
 
-    /// Counts a stated label for the chance agreement. The sums are halved at [`SHARES_MEMORY`], so
+    /// Counts a stated label for the chance agreement. The sums are halved at [`LONG_MEMORY_VOTES`], so
     /// that old labels fade.
     fn count_label(&mut self, label: LabelIndex) {
         let label = usize::from(label);
         if self.stated.len() <= label {
             self.stated.resize(label + 1, 0.0);
         }
-        if self.total >= SHARES_MEMORY {
+        if self.total >= LONG_MEMORY_VOTES {
             self.stated.iter_mut().for_each(|n| *n /= 2.0);
             self.total /= 2.0;
             self.squares /= 4.0;
@@ -286,13 +247,13 @@ impl Dependence {
         let typical = typical_agreement(&belonging, pairs);
         let mut rhos: Vec<f64> = pairs
             .iter()
-            .map(|(_, _, pair)| pair.excess(typical, self.significance))
+            .map(|(_, _, pair)| pair.excess(typical))
             .collect();
         let mut factors = vec![0.5; vehicles];
-        for _ in 0..FACTOR_STEPS {
+        for _ in 0..ITERATIONS {
             factors = next_factors(&factors, &belonging, pairs, &rhos);
             for (rho, (one, other, pair)) in rhos.iter_mut().zip(pairs.iter()) {
-                *rho = pair.excess(factors[one] * factors[other], self.significance);
+                *rho = pair.excess(factors[one] * factors[other]);
             }
         }
         self.partners = vec![Vec::new(); vehicles];
@@ -315,7 +276,7 @@ impl Dependence {
 /// Pelillo 2007). It is found by power iteration that drops negative parts.
 fn main_group(influences: &[f64], pairs: &Pairs) -> Vec<f64> {
     let mut belonging = influences.to_vec();
-    for _ in 0..GROUPING_STEPS {
+    for _ in 0..ITERATIONS {
         let mut support: Vec<f64> = belonging.iter().map(|own| SELF_SUPPORT * own).collect();
         for (one, other, pair) in pairs.iter() {
             let affinity = (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.compared

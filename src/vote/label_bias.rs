@@ -19,10 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::dependence::ComparedVote;
 use super::index_map::{LabelIndex, LabelMap};
-
-/// φ₀: the contingency of vehicles and labels up to which one accuracy per vehicle describes them
-/// better than a confusion matrix that is estimated from votes.
-const TOLERATED_PHI: f64 = 0.22;
+use super::parameters::TOLERATED_PHI;
 
 /// Fading sums of one vehicle over its votes that could be compared.
 #[derive(Debug, Clone, Default)]

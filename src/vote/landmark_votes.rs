@@ -7,12 +7,9 @@ use super::dependence::{ComparedVote, Dependence};
 use super::index_map::LabelIndex;
 use super::label_bias::LabelBias;
 use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
+use super::parameters::{INDEPENDENT_FRAMES, MIN_STATEMENT_WEIGHT};
 use crate::model::time::Timestamp;
 
-/// Independent part of a vehicle's statements, because consecutive frames are similar.
-const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
-/// Minimum weight of a statement among the vehicle's own statements.
-const MIN_WEIGHT: f64 = 0.01;
 /// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
 const NORMAL_TO_LOGISTIC: f64 = 0.8;
 
@@ -66,7 +63,8 @@ impl RecentStatements {
         let least = places.clone().min_by(by_sum);
         let stated = known.or(least).unwrap_or_default();
         self.labels[stated] = label;
-        self.sums[stated] = weight.max(MIN_WEIGHT) + known.map_or(0.0, |known| self.sums[known]);
+        self.sums[stated] =
+            weight.max(MIN_STATEMENT_WEIGHT) + known.map_or(0.0, |known| self.sums[known]);
         let by_sum = |a: &usize, b: &usize| self.sums[*a].total_cmp(&self.sums[*b]);
         let more = places.filter(|&place| self.sums[place] > self.sums[stated]);
         self.labels[more.max_by(by_sum).unwrap_or(stated)]

@@ -22,14 +22,12 @@ use super::landmark_table::LandmarkTable;
 use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
 use super::method::{self, NewVote, VotingMethod};
 use super::paper::REPUTATION_RANGE;
+use super::parameters::MANY_DEPENDENT;
 use super::visibility;
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{Reputation, Verdict};
-
-/// Share of dependent vehicles among the present ones from which they may have decided verdicts.
-const MANY_DEPENDENT: f64 = 0.2;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
 #[derive(Debug, Clone, Default)]

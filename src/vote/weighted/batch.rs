@@ -11,7 +11,7 @@ impl WeightedVoting {
     /// Evaluates all stored votes `passes` times together, starting from the majorities (Dawid &
     /// Skene 1979).
     pub(super) fn judge_all(&mut self, passes: u32) {
-        let mut dependence = Dependence::of_stored();
+        let mut dependence = Dependence::new(f64::INFINITY);
         let mut label_bias = LabelBias::new(f64::INFINITY);
         let mut calibration = ConfidenceCalibration::new(self.config.calibration_votes);
         let mut vehicles: Vec<(&NodeName, &usize)> = self.vehicles.iter().collect();
