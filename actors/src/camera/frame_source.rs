@@ -1,6 +1,7 @@
 //! Sources of frames: one trait, one file per kind. [`capture`] runs a source on its own thread.
 
 pub mod capture;
+mod capture_clock;
 pub(crate) mod images;
 mod v4l2;
 pub mod video;
@@ -13,6 +14,7 @@ use ecod::logins::{HIDDEN, bare_address};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+pub use self::capture_clock::TimeSource;
 use self::images::ImageSequence;
 use self::v4l2::V4l2Camera;
 use self::video::VideoProcess;
@@ -26,6 +28,9 @@ pub trait FrameSource: Send {
     /// Returns a [`FrameError`]. After [`FrameError::Unusable`] and [`FrameError::NotDue`] the source
     /// continues; after other errors it must be reopened.
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError>;
+
+    /// How the capture time of the latest frame was determined.
+    fn time_source(&self) -> TimeSource;
 }
 
 /// Error of a frame source.
@@ -91,6 +96,9 @@ impl FrameError {
     }
 }
 
+/// Maximum configured time from capture to arrival in seconds.
+const MAX_LATENCY_S: f64 = 10.0;
+
 /// Configuration of a frame source.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
@@ -110,17 +118,27 @@ pub enum SourceConfig {
         /// Requested frames per second. Default 30.
         #[serde(default)]
         fps: Option<f64>,
+        /// Seconds from capture to arrival. Default: not set; then the driver's stamps count.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        latency_s: Option<f64>,
     },
     /// A GStreamer pipeline that ends in `appsink`, for example with `libcamerasrc` on a Raspberry
     /// Pi.
     Gstreamer {
         /// The pipeline as for `gst-launch-1.0`; BGR, with `appsink drop=true max-buffers=1`.
         pipeline: String,
+        /// Seconds from capture to arrival. Default 0.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        latency_s: Option<f64>,
     },
     /// A network camera, which is read by its address.
     Url {
         /// Its `rtsp://` or `http://` address.
         url: String,
+        /// Seconds from capture to arrival. Default: not set; then `X-Timestamp` of motion JPEG
+        /// over HTTP counts, and other streams have 0.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        latency_s: Option<f64>,
     },
     /// A video file, played at the times of its frames and turned upright.
     Video {
@@ -157,10 +175,12 @@ impl SourceConfig {
                 width,
                 height,
                 fps,
+                latency_s,
             } => Ok(Box::new(V4l2Camera::open(
                 device,
                 [*width, *height],
                 *fps,
+                *latency_s,
                 timeout,
             )?)),
             Self::Images { path, fps, looping } => {
@@ -172,14 +192,24 @@ impl SourceConfig {
         }
     }
 
+    /// Configured seconds from capture to arrival; `None` for recordings.
+    fn latency_s(&self) -> Option<f64> {
+        match self {
+            Self::V4l2 { latency_s, .. }
+            | Self::Gstreamer { latency_s, .. }
+            | Self::Url { latency_s, .. } => *latency_s,
+            Self::Video { .. } | Self::Images { .. } => None,
+        }
+    }
+
     /// Device, pipeline, address or path in a form that may be shown: without user and password.
     fn origin(&self) -> String {
         match self {
             Self::V4l2 { device: path, .. }
             | Self::Video { path, .. }
             | Self::Images { path, .. } => path.display().to_string(),
-            Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
-            Self::Url { url } => match url.split_once("://") {
+            Self::Gstreamer { pipeline, .. } => video::without_credentials(pipeline),
+            Self::Url { url, .. } => match url.split_once("://") {
                 Some((scheme, address)) => {
                     let bare = bare_address(address).unwrap_or(HIDDEN);
                     video::without_credentials(&format!("{scheme}://{bare}"))
@@ -194,7 +224,7 @@ impl SourceConfig {
     /// A text about this source without its secrets, such as an error of a library.
     fn redacted(&self, text: &str) -> String {
         let mut text = text.to_owned();
-        if let Self::Url { url } = self {
+        if let Self::Url { url, .. } = self {
             text = text.replace(url, &self.origin());
             let until_host = url
                 .rsplit_once('@')
@@ -216,8 +246,8 @@ impl SourceConfig {
     pub(crate) fn remove_credentials(&mut self) -> Option<&'static str> {
         let bare = self.origin();
         let (key, text) = match self {
-            Self::Url { url } => ("url", url),
-            Self::Gstreamer { pipeline } => ("pipeline", pipeline),
+            Self::Url { url, .. } => ("url", url),
+            Self::Gstreamer { pipeline, .. } => ("pipeline", pipeline),
             _ => return None,
         };
         let had = bare != *text;
@@ -230,6 +260,9 @@ impl SourceConfig {
     /// # Errors
     /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
+        if let Some(latency_s) = self.latency_s() {
+            check_range("latency_s", latency_s, 0.0, MAX_LATENCY_S)?;
+        }
         match self {
             Self::V4l2 {
                 width, height, fps, ..
@@ -242,12 +275,10 @@ impl SourceConfig {
                 fps.map_or(Ok(()), |fps| check_range("fps", fps, 0.01, 1000.0))
             }
             Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
-            Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => Err(ConfigError::new(
-                "pipeline",
-                self.origin(),
-                "a pipeline that ends in appsink",
-            )),
-            Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(
+            Self::Gstreamer { pipeline, .. } if !pipeline.contains("appsink") => Err(
+                ConfigError::new("pipeline", self.origin(), "a pipeline that ends in appsink"),
+            ),
+            Self::Url { url, .. } if !has_known_scheme(url) => Err(ConfigError::new(
                 "url",
                 self.origin(),
                 "an address that begins with rtsp://, rtsps://, http:// or https://",

@@ -50,15 +50,14 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         // The receiver is gone after the timeout.
-        let _ = sender.send(
-            source
-                .open(TIMEOUT)
-                .and_then(|mut source| source.next_frame()),
-        );
+        let _ = sender.send(source.open(TIMEOUT).and_then(|mut source| {
+            let frame = source.next_frame()?;
+            Ok((frame, source.time_source()))
+        }));
     });
     let lens = camera.optics.lens().ok();
     match tokio::time::timeout(TIMEOUT, answer).await {
-        Ok(Ok(Ok(frame))) => {
+        Ok(Ok(Ok((frame, time_source)))) => {
             let size = ImageSize::of(&frame.image);
             if let Some(Err(mismatch)) = lens.map(|lens| lens.of_frames(size)) {
                 let seen = format!("frames of {size}, but optics of {}", mismatch.optics);
@@ -66,7 +65,7 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
                 return (Finding::broken(check, seen, fix), None);
             }
             (
-                Finding::fine(check, format!("frames of {size}")),
+                Finding::fine(check, format!("frames of {size}, dated by {time_source}")),
                 Some(frame),
             )
         }

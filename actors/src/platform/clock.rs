@@ -39,7 +39,17 @@ pub fn wall() -> Timestamp {
 
 /// Time since the machine started, including suspension.
 pub fn since_boot() -> Duration {
-    let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Boottime);
+    read(ClockId::Boottime)
+}
+
+/// The kernel's monotonic clock, which stamps pictures of cameras. It stands still in suspension,
+/// so only differences count.
+pub fn monotonic() -> Duration {
+    read(ClockId::Monotonic)
+}
+
+fn read(clock: ClockId) -> Duration {
+    let Timespec { tv_sec, tv_nsec } = clock_gettime(clock);
     Duration::new(
         u64::try_from(tv_sec).unwrap_or_default(),
         u32::try_from(tv_nsec).unwrap_or_default(),

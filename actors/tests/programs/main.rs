@@ -20,6 +20,8 @@ mod status;
 #[cfg(feature = "camera")]
 mod try_pictures;
 #[cfg(feature = "camera")]
+mod v4l2_camera;
+#[cfg(feature = "camera")]
 mod video_sources;
 
 use std::process::Command;

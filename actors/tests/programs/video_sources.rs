@@ -6,12 +6,13 @@ use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use ecod::model::time::Timestamp;
 use ecod_actors::camera::frame::CameraFrame;
 use ecod_actors::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus};
-use ecod_actors::camera::frame_source::{FrameError, FrameSource, SourceConfig};
+use ecod_actors::camera::frame_source::{FrameError, FrameSource, SourceConfig, TimeSource};
 use ecod_actors::camera::image_codec::encode_jpeg;
 use ecod_actors::platform::clock;
 use ecod_testkit::{PATIENCE, until_blocking as until};
@@ -277,6 +278,28 @@ fn a_pipeline_gives_frames() {
 }
 
 #[test]
+fn late_reading_keeps_spacing() {
+    let pipeline = "videotestsrc is-live=true ! video/x-raw,width=640,height=480,framerate=20/1 ! videoconvert ! \
+                    video/x-raw,format=BGR ! appsink";
+    let mut source = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'")).unwrap();
+    let mut times = Vec::new();
+    for number in 0..40 {
+        std::thread::sleep(Duration::from_millis(number * 37 % 110));
+        times.push(source.next_frame().unwrap().captured_at);
+    }
+    assert_eq!(source.time_source(), TimeSource::Position);
+    let steps_ms: Vec<f64> = times
+        .windows(2)
+        .map(|pair| pair[1].micros_from(pair[0]) as f64 / 1e3)
+        .collect();
+    let off: Vec<_> = steps_ms
+        .iter()
+        .filter(|step| (*step - (*step / 50.0).round() * 50.0).abs() > 5.0)
+        .collect();
+    assert!(off.len() < 4, "{steps_ms:?}");
+}
+
+#[test]
 fn missing_pipeline_element_is_named() {
     let pipeline = "nosuchsrc location=rtsp://user:hunter2@camera/1 ! appsink";
     let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'"))
@@ -315,35 +338,49 @@ fn motion_jpeg(visitor: TcpStream) -> std::io::Result<()> {
 
 /// Motion JPEG over HTTP, the protocol of cheap network cameras.
 fn send_pictures(mut visitor: TcpStream, pictures: &[Vec<u8>]) -> std::io::Result<()> {
+    if begin_stream(&mut visitor)? {
+        for jpeg in pictures {
+            send_picture(&mut visitor, jpeg, "")?;
+        }
+    }
+    Ok(())
+}
+
+/// Answers the request for a stream; false if the login is missing.
+fn begin_stream(visitor: &mut TcpStream) -> std::io::Result<bool> {
     let request = BufReader::new(visitor.try_clone()?);
     let lines: Vec<String> = request
         .lines()
         .map_while(Result::ok)
         .take_while(|line| !line.is_empty())
         .collect();
-    if !lines
-        .iter()
-        .any(|line| line.starts_with("Authorization: Basic "))
-    {
-        return write!(
-            visitor,
-            "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n"
-        );
-    }
-    write!(
-        visitor,
-        "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n"
-    )?;
-    for jpeg in pictures {
+    let has_login = lines.iter().any(|line| {
+        line.to_ascii_lowercase()
+            .starts_with("authorization: basic ")
+    });
+    if has_login {
         write!(
             visitor,
-            "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n",
-            jpeg.len()
+            "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n"
         )?;
-        visitor.write_all(jpeg)?;
-        write!(visitor, "\r\n")?;
+    } else {
+        write!(
+            visitor,
+            "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n"
+        )?;
     }
-    Ok(())
+    Ok(has_login)
+}
+
+/// `header` is one more line of the part's header with its end, or empty.
+fn send_picture(visitor: &mut TcpStream, jpeg: &[u8], header: &str) -> std::io::Result<()> {
+    write!(
+        visitor,
+        "--frame\r\nContent-Type: image/jpeg\r\n{header}Content-Length: {}\r\n\r\n",
+        jpeg.len()
+    )?;
+    visitor.write_all(jpeg)?;
+    write!(visitor, "\r\n")
 }
 
 #[test]
@@ -362,6 +399,66 @@ fn network_camera_works_until_disconnect() {
         origin.ends_with("/stream") && !origin.contains("hunter2"),
         "{origin}"
     );
+}
+
+/// Reads a network camera whose pictures arrive 60 to 180 ms after their capture, and are read
+/// later still. `header` makes the line of a picture's header from the true time. Returns the
+/// differences of stated and true times in ms, ascending, and the source of the stated times.
+fn errors_of_stated_times(
+    header: impl Fn(Timestamp) -> String + Send + 'static,
+) -> (Vec<f64>, TimeSource) {
+    let taken = Arc::new(Mutex::new(Vec::new()));
+    let written = Arc::clone(&taken);
+    let url = network_camera(move |mut visitor| {
+        if !begin_stream(&mut visitor)? {
+            return Ok(());
+        }
+        for number in 0..24_u8 {
+            let at = clock::wall();
+            written.lock().unwrap().push(at);
+            let jpeg = encode_jpeg(&gray(40 + 4 * number), 95).unwrap();
+            let way_ms = 60 + u64::from(number) * 5 % 7 * 20;
+            std::thread::sleep(Duration::from_millis(way_ms));
+            send_picture(&mut visitor, &jpeg, &header(at))?;
+        }
+        Ok(())
+    });
+    let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
+    let mut errors = Vec::new();
+    while let Ok(frame) = source.next_frame() {
+        let number = usize::from(brightness(&frame).saturating_sub(38)) / 4;
+        let truth = taken.lock().unwrap()[number].shifted(-clock::wall_offset_us());
+        errors.push(frame.captured_at.micros_from(truth) as f64 / 1e3);
+        std::thread::sleep(Duration::from_millis(number as u64 * 37 % 90));
+    }
+    assert_eq!(errors.len(), 24);
+    errors.sort_by(f64::total_cmp);
+    (errors, source.time_source())
+}
+
+fn p95(sorted: &[f64]) -> f64 {
+    sorted[sorted.len() * 95 / 100]
+}
+
+#[test]
+fn header_of_picture_gives_time() {
+    let stamp = |at: Timestamp| format!("X-Timestamp: {at}\r\n");
+    let (errors, time_source) = errors_of_stated_times(stamp);
+    assert_eq!(time_source, TimeSource::Stamp);
+    assert!(errors.iter().all(|error| error.abs() < 2.0), "{errors:?}");
+
+    let (errors, time_source) = errors_of_stated_times(|_| String::new());
+    assert_eq!(time_source, TimeSource::Arrival);
+    assert!(p95(&errors) > 60.0, "the test delays pictures: {errors:?}");
+}
+
+#[test]
+fn wrong_camera_clock_spaces_pictures() {
+    let slow = |at: Timestamp| format!("X-Timestamp: {}\r\n", at - Duration::from_secs(3600));
+    let (errors, time_source) = errors_of_stated_times(slow);
+    assert_eq!(time_source, TimeSource::Position);
+    let spread = errors[errors.len() - 1] - errors[0];
+    assert!(spread < 20.0, "{errors:?}");
 }
 
 #[test]

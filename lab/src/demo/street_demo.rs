@@ -137,7 +137,10 @@ impl StreetDemo<'_> {
                 .drives(camera)
                 .then(|| stage.pose_address(number + 1));
             driving.extend(poses.map(|address| (number, address)));
-            let source = SourceConfig::Url { url: served.url() };
+            let source = SourceConfig::Url {
+                url: served.url(),
+                latency_s: None,
+            };
             configs.push(camera_node(&street, camera, source, poses));
         }
         let localisation = tokio::spawn(send_poses(Arc::clone(&street), driving, start));

@@ -389,8 +389,14 @@ impl Reader {
             Ok(source) => source,
             Err(error) => return self.send(Err(error)),
         };
+        let mut time_source = None;
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
+            let present = read.is_ok().then(|| source.time_source());
+            if let Some(present) = present.filter(|present| time_source != Some(*present)) {
+                tracing::info!(by = %present, "frames are dated");
+                time_source = Some(present);
+            }
             let failed = read.as_ref().is_err_and(|error| !error.is_passing());
             self.send(read);
             if failed {

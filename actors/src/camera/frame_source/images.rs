@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameError, FramePacer, FrameSource};
+use super::{FrameError, FramePacer, FrameSource, TimeSource};
 use crate::camera::frame::CameraFrame;
 use crate::camera::image_codec;
 use crate::platform::clock;
@@ -74,6 +74,10 @@ impl FrameSource for ImageSequence {
             captured_at: clock::now(),
             seq,
         })
+    }
+
+    fn time_source(&self) -> TimeSource {
+        TimeSource::Playback
     }
 }
 

@@ -190,6 +190,24 @@ fn bad_configuration_is_refused() {
     assert_eq!(camera.validate().expect_err("no width").key, "width");
     let images: SourceConfig = toml::from_str("kind = 'images'\npath = 'a'\nfps = 0.0").unwrap();
     assert_eq!(images.validate().expect_err("no rate").key, "fps");
+    for source in [
+        "kind = 'v4l2'",
+        "kind = 'gstreamer'\npipeline = 'videotestsrc ! appsink'",
+        "kind = 'url'\nurl = 'rtsp://camera/1'",
+    ] {
+        let with = |latency_s: &str| {
+            let text = format!("{source}\nlatency_s = {latency_s}");
+            toml::from_str::<SourceConfig>(&text).unwrap().validate()
+        };
+        assert_eq!(with("0.35"), Ok(()));
+        for latency_s in ["-0.1", "10.5", "nan"] {
+            assert_eq!(with(latency_s).expect_err(latency_s).key, "latency_s");
+        }
+    }
+    assert!(
+        toml::from_str::<SourceConfig>("kind = 'video'\npath = 'a'\nlatency_s = 0.1").is_err(),
+        "a recording has none"
+    );
 }
 
 #[test]
@@ -205,7 +223,10 @@ fn source_texts_hide_password() {
         "eim1",
     ] {
         let url = format!("rtsp://admin:{password}@127.0.0.1:1/stream1");
-        let mut source = SourceConfig::Url { url: url.clone() };
+        let mut source = SourceConfig::Url {
+            url: url.clone(),
+            latency_s: None,
+        };
         let said = [
             source.origin(),
             source.redacted(&format!("cannot open {url}: refused")),
@@ -226,6 +247,7 @@ fn source_texts_hide_password() {
         let quote = if password.contains('"') { '\'' } else { '"' };
         let mut pipeline = SourceConfig::Gstreamer {
             pipeline: format!("rtspsrc location={quote}{url}{quote} ! fakesink"),
+            latency_s: None,
         };
         let error = pipeline.validate().expect_err("no appsink").to_string();
         assert!(!error.contains("eim1") && !error.contains("Geh"), "{error}");

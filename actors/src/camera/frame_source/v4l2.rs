@@ -4,16 +4,20 @@
 mod pixels;
 
 use std::io;
-use std::os::fd::AsFd;
 use std::path::Path;
 use std::time::Duration;
 
-use linuxvideo::format::PixFormat;
-use linuxvideo::stream::ReadStream;
-use linuxvideo::{BufType, CapabilityFlags, Device, Fract};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use moq_v4l::buffer::{self, Metadata};
+use moq_v4l::io::mmap::Stream;
+use moq_v4l::io::traits::CaptureStream;
+use moq_v4l::video::Capture;
+use moq_v4l::video::capture::Parameters;
+use moq_v4l::{Device, Format, FourCC, Fraction};
+use rustix::event::PollFlags;
+use rustix::io::Errno;
 
 use self::pixels::{FrameLayout, PixelConversion};
+use super::capture_clock::{CaptureClock, FrameStamp, MAX_DELAY, TimeSource};
 use super::{FrameError, FrameSource};
 use crate::camera::frame::CameraFrame;
 use crate::platform::clock;
@@ -22,12 +26,18 @@ use crate::platform::clock;
 const DEFAULT_SIZE: [u32; 2] = [640, 480];
 const DEFAULT_FPS: f64 = 30.0;
 
+/// Number of buffers: two for the driver while the reader has one.
+const BUFFERS: u32 = 3;
+
 /// A camera that takes pictures.
 pub(super) struct V4l2Camera {
     origin: String,
-    stream: ReadStream,
+    stream: Stream<'static>,
+    is_streaming: bool,
     layout: FrameLayout,
     timeout: Duration,
+    clock: CaptureClock,
+    time_source: TimeSource,
     seq: u64,
 }
 
@@ -38,6 +48,7 @@ impl V4l2Camera {
         device: &Path,
         size: [Option<u32>; 2],
         fps: Option<f64>,
+        latency_s: Option<f64>,
         timeout: Duration,
     ) -> Result<Self, FrameError> {
         let origin = device.display().to_string();
@@ -53,45 +64,55 @@ impl V4l2Camera {
             }
         };
         std::fs::File::open(device).map_err(|error| failed(error.to_string()))?;
-        let opened = Device::open(device).map_err(refused("it is no camera"))?;
-        let able = opened
-            .capabilities()
-            .map_err(refused("it is no camera"))?
-            .device_capabilities();
-        if !able.contains(CapabilityFlags::VIDEO_CAPTURE | CapabilityFlags::STREAMING) {
+        let opened = Device::with_path(device).map_err(refused("it cannot be opened"))?;
+        // `query_caps` of the library panics at a name that is not UTF-8.
+        if let Err(error) = opened.format()
+            && error.raw_os_error() == Some(Errno::NOTTY.raw_os_error())
+        {
+            return Err(refused("it is no camera")(error));
+        }
+        let formats = opened
+            .enum_formats()
+            .map_err(refused("its formats cannot be listed"))?;
+        if formats.is_empty() {
             return Err(failed(
                 "it streams no pictures: a camera may have several devices, try the others".into(),
             ));
         }
-        let offered = opened
-            .formats(BufType::VIDEO_CAPTURE)
-            .map(|format| Ok(format?.pixel_format()))
-            .collect::<io::Result<Vec<_>>>()
-            .map_err(refused("its formats cannot be listed"))?;
+        let offered: Vec<_> = formats.iter().map(|format| format.fourcc).collect();
         let conversion = PixelConversion::choose(&offered).ok_or_else(|| {
             failed(format!(
-                "its pictures have the formats {offered:?}, need one of {:?}",
-                PixelConversion::formats()
+                "its pictures have the formats {}, need one of {}",
+                names(&offered),
+                names(&PixelConversion::formats())
             ))
         })?;
         let [width, height] = [0, 1].map(|side| size[side].unwrap_or(DEFAULT_SIZE[side]));
-        let camera = opened
-            .video_capture(PixFormat::new(width, height, conversion.format()))
+        let chosen = opened
+            .set_format(&Format::new(width, height, conversion.format()))
             .map_err(refused("it refuses the format"))?;
-        let layout = FrameLayout::new(conversion, camera.format()).map_err(failed)?;
+        let layout = FrameLayout::new(conversion, &chosen).map_err(failed)?;
         let fps = fps.unwrap_or(DEFAULT_FPS);
-        match camera.set_frame_interval(Fract::new(1000, (fps * 1000.0).round().max(1.0) as u32)) {
-            Ok(interval) => tracing::debug!(camera = origin, ?layout, %interval, "camera opened"),
+        let interval = Fraction::new(1000, (fps * 1000.0).round().max(1.0) as u32);
+        match opened.set_params(&Parameters::new(interval)) {
+            Ok(Parameters { interval, .. }) => {
+                tracing::debug!(camera = origin, ?layout, %interval, "camera opened");
+            }
             Err(error) => {
                 tracing::debug!(camera = origin, ?layout, fps, %error, "camera rejects the rate");
             }
         }
-        let stream = camera.into_stream().map_err(refused("it does not start"))?;
+        let mut stream = Stream::with_buffers(&opened, buffer::Type::VideoCapture, BUFFERS)
+            .map_err(refused("it does not start"))?;
+        stream.set_timeout(timeout);
         Ok(Self {
             origin,
             stream,
+            is_streaming: false,
             layout,
             timeout,
+            clock: CaptureClock::new(latency_s),
+            time_source: TimeSource::Arrival,
             seq: 0,
         })
     }
@@ -105,17 +126,14 @@ impl V4l2Camera {
 
     /// Waits until a buffer is filled, or the camera is gone.
     fn wait(&self) -> Result<(), FrameError> {
-        let timeout =
-            Timespec::try_from(self.timeout).map_err(|e| self.lost(&io::Error::other(e)))?;
+        let device = self.stream.handle();
+        let timeout_ms = i32::try_from(self.timeout.as_millis()).unwrap_or(i32::MAX);
         loop {
-            match poll(
-                &mut [PollFd::new(&self.stream.as_fd(), PollFlags::IN)],
-                Some(&timeout),
-            ) {
+            match device.poll(PollFlags::IN.bits() as i16, timeout_ms) {
                 Ok(0) => return Err(FrameError::Stalled(self.timeout)),
                 Ok(_) => return Ok(()),
-                Err(rustix::io::Errno::INTR) => {}
-                Err(error) => return Err(self.lost(&error.into())),
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(self.lost(&error)),
             }
         }
     }
@@ -123,28 +141,71 @@ impl V4l2Camera {
 
 impl FrameSource for V4l2Camera {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
-        self.wait()?;
-        let layout = self.layout;
-        let taken = self.stream.dequeue(|buffer| {
-            let captured_at = clock::now();
-            let image = if buffer.is_error() {
-                Err("broken on its way".into())
-            } else {
-                layout.to_bgr(&buffer)
-            };
-            Ok((captured_at, image))
-        });
-        let (captured_at, image) = taken.map_err(|error| self.lost(&error))?;
+        if std::mem::replace(&mut self.is_streaming, true) {
+            self.wait()?;
+        }
+        // Starts the camera, or returns the buffer of the frame before to the driver.
+        let (pixels, metadata) = match CaptureStream::next(&mut self.stream) {
+            Ok(filled) => filled,
+            Err(error) if error.kind() == io::ErrorKind::TimedOut => {
+                return Err(FrameError::Stalled(self.timeout));
+            }
+            Err(error) => {
+                return Err(FrameError::Lost {
+                    origin: self.origin.clone(),
+                    reason: error.to_string(),
+                });
+            }
+        };
+        let arrived_at = clock::now();
+        let stamp = age(metadata, clock::monotonic()).map(|age| FrameStamp::Time(arrived_at - age));
+        let used = pixels.len().min(metadata.bytesused as usize);
+        let image = if metadata.flags.contains(buffer::Flags::ERROR) {
+            Err("broken on its way".into())
+        } else {
+            self.layout.to_bgr(&pixels[..used])
+        };
         let image = image.map_err(|reason| FrameError::Unusable {
             origin: self.origin.clone(),
             reason,
         })?;
+        let time = self.clock.time(stamp, arrived_at);
+        self.time_source = time.source;
         let frame = CameraFrame {
             image,
-            captured_at,
+            captured_at: time.captured_at,
             seq: self.seq,
         };
         self.seq += 1;
         Ok(frame)
     }
+
+    fn time_source(&self) -> TimeSource {
+        self.time_source
+    }
 }
+
+/// Time from the capture that the driver states to `now` on the monotonic clock. The driver's stamp
+/// is the start of exposure or the end of the frame, by the flag `TSTAMP_SRC_SOE`
+/// ([V4L2](https://docs.kernel.org/userspace-api/media/v4l/buffer.html#buffer-flags)).
+///
+/// `None` if the stamp is of another clock, of the future, or older than [`MAX_DELAY`].
+fn age(metadata: &Metadata, now: Duration) -> Option<Duration> {
+    let clock = metadata.flags & buffer::Flags::TIMESTAMP_MASK;
+    if clock != buffer::Flags::TIMESTAMP_MONOTONIC {
+        return None;
+    }
+    let seconds = u64::try_from(metadata.timestamp.sec).ok()?;
+    let micros = u64::try_from(metadata.timestamp.usec).ok()?;
+    let stamp = Duration::from_secs(seconds).checked_add(Duration::from_micros(micros))?;
+    now.checked_sub(stamp).filter(|age| *age <= MAX_DELAY)
+}
+
+/// Names of pixel formats in a text.
+fn names(formats: &[FourCC]) -> String {
+    let names: Vec<_> = formats.iter().map(FourCC::to_string).collect();
+    names.join(", ")
+}
+
+#[cfg(test)]
+mod tests;

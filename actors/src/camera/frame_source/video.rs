@@ -12,6 +12,7 @@
 //! The program ends when its standard input closes, which also happens when the node is killed. Its
 //! standard error, including output of its libraries, becomes debug lines of the node's log.
 
+mod motion_jpeg;
 pub mod program;
 mod protocol;
 
@@ -29,7 +30,7 @@ use regex_lite::Regex;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
-use super::{FrameError, FrameSource, SourceConfig};
+use super::{FrameError, FrameSource, SourceConfig, TimeSource};
 use crate::camera::frame::CameraFrame;
 use crate::platform::{clock, installed};
 
@@ -57,6 +58,7 @@ pub(super) struct VideoProcess {
     output: BufReader<DeadlineReader>,
     last_words: LastWords,
     frame_time: Duration,
+    time_source: TimeSource,
     seq: u64,
 }
 
@@ -111,6 +113,7 @@ impl VideoProcess {
             output,
             last_words,
             frame_time,
+            time_source: TimeSource::Arrival,
             seq: 0,
         };
         match process.receive(MIN_OPEN_TIME.max(frame_time)) {
@@ -140,6 +143,7 @@ impl VideoProcess {
             columns,
             kind,
             since_boot,
+            time_source,
         } = *header;
         if i64::from(rows) * i64::from(columns) > MAX_PIXELS {
             return Err(self.lost(format!("{columns} by {rows} pixels are too many")));
@@ -150,6 +154,7 @@ impl VideoProcess {
         self.output
             .read_exact(pixels)
             .map_err(|e| self.broken(&e, self.frame_time))?;
+        self.time_source = time_source;
         let frame = CameraFrame {
             image,
             captured_at: clock::at(since_boot),
@@ -201,6 +206,10 @@ impl FrameSource for VideoProcess {
             VideoMessage::Failed(error) => Err(error.redacted(&self.source)),
             VideoMessage::Opened => Err(self.lost(format!("{PROGRAM} is of another version"))),
         }
+    }
+
+    fn time_source(&self) -> TimeSource {
+        self.time_source
     }
 }
 

@@ -84,8 +84,12 @@ impl PictureSource {
                 width: None,
                 height: None,
                 fps: None,
+                latency_s: None,
             },
-            Self::Url(url) => SourceConfig::Url { url },
+            Self::Url(url) => SourceConfig::Url {
+                url,
+                latency_s: None,
+            },
         }
     }
 }

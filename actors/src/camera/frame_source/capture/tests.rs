@@ -5,6 +5,7 @@ use ecod::model::time::Timestamp;
 use opencv::core::Mat;
 
 use super::*;
+use crate::camera::frame_source::TimeSource;
 
 /// Action of a scripted source on one call.
 enum Step {
@@ -44,6 +45,10 @@ impl FrameSource for Script {
                 origin: "script".into(),
             }),
         }
+    }
+
+    fn time_source(&self) -> TimeSource {
+        TimeSource::Playback
     }
 }
 

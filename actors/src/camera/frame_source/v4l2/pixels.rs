@@ -2,7 +2,7 @@
 //! taken from the kernel's
 //! [Video4Linux API](https://docs.kernel.org/userspace-api/media/v4l/pixfmt.html).
 
-use linuxvideo::format::{PixFormat, PixelFormat};
+use moq_v4l::{Format, FourCC};
 use opencv::core::{Mat, Rect, Vec2b, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
@@ -54,19 +54,19 @@ const CONVERSIONS: [PixelConversion; 11] = {
 
 impl PixelConversion {
     /// All formats that can be converted, the preferred first.
-    pub(super) fn formats() -> [PixelFormat; CONVERSIONS.len()] {
+    pub(super) fn formats() -> [FourCC; CONVERSIONS.len()] {
         CONVERSIONS.map(Self::format)
     }
 
     /// The preferred format among those that a camera offers.
-    pub(super) fn choose(offered: &[PixelFormat]) -> Option<Self> {
+    pub(super) fn choose(offered: &[FourCC]) -> Option<Self> {
         CONVERSIONS
             .into_iter()
             .find(|conversion| offered.contains(&conversion.format()))
     }
 
-    pub(super) fn format(self) -> PixelFormat {
-        PixelFormat::from_fourcc(self.fourcc)
+    pub(super) fn format(self) -> FourCC {
+        FourCC::new(&self.fourcc)
     }
 }
 
@@ -84,19 +84,15 @@ pub(super) struct FrameLayout {
 impl FrameLayout {
     /// The layout of the format that the driver has chosen, which may have another size than
     /// requested.
-    pub(super) fn new(conversion: PixelConversion, chosen: &PixFormat) -> Result<Self, String> {
-        let got = chosen.pixel_format();
+    pub(super) fn new(conversion: PixelConversion, chosen: &Format) -> Result<Self, String> {
+        let got = chosen.fourcc;
         let wanted = conversion.format();
         if got != wanted {
             return Err(format!(
                 "it has the format {wanted} and gives {got}: another program may use it"
             ));
         }
-        Self::of(
-            conversion.way,
-            [chosen.width(), chosen.height()],
-            chosen.bytes_per_line(),
-        )
+        Self::of(conversion.way, [chosen.width, chosen.height], chosen.stride)
     }
 
     fn of(way: Way, [width, height]: [u32; 2], bytes_per_line: u32) -> Result<Self, String> {

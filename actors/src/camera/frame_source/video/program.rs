@@ -10,15 +10,18 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use ecod::model::time::Timestamp;
 use opencv::core::{self, Mat, Size, Vector};
 use opencv::imgproc;
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 use rustix::process::{Signal, getpid, kill_process};
 
+use super::motion_jpeg::MotionJpeg;
 use super::protocol::{self, ImageHeader, VideoMessage, VideoRequest};
 use crate::camera::frame::CameraFrame;
-use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig};
+use crate::camera::frame_source::capture_clock::{CaptureClock, FrameStamp};
+use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig, TimeSource};
 use crate::camera::image_codec::{self, ImageError};
 use crate::platform::clock;
 
@@ -44,7 +47,7 @@ fn serve() -> anyhow::Result<()> {
     let VideoRequest { source, timeout } = serde_json::from_str(&request)
         .context("ecod-node starts this program and sends the source to open on standard input")?;
     thread::spawn(end_with_input);
-    let mut video = match Video::open(&source, timeout) {
+    let mut video = match open(&source, timeout) {
         Ok(video) => video,
         Err(error) => {
             return Ok(protocol::write_line(
@@ -56,7 +59,7 @@ fn serve() -> anyhow::Result<()> {
     protocol::write_line(&mut output, &VideoMessage::Opened)?;
     loop {
         match video.next_frame() {
-            Ok(frame) => write_frame(&mut output, &frame)?,
+            Ok(frame) => write_frame(&mut output, &frame, video.time_source())?,
             Err(error) if error.is_passing() => {
                 protocol::write_line(&mut output, &VideoMessage::Failed(error))?;
             }
@@ -88,7 +91,11 @@ fn end_with_input() {
     let _ = kill_process(getpid(), Signal::KILL);
 }
 
-fn write_frame(output: &mut File, frame: &CameraFrame) -> anyhow::Result<()> {
+fn write_frame(
+    output: &mut File,
+    frame: &CameraFrame,
+    time_source: TimeSource,
+) -> anyhow::Result<()> {
     let CameraFrame {
         image, captured_at, ..
     } = frame;
@@ -98,6 +105,7 @@ fn write_frame(output: &mut File, frame: &CameraFrame) -> anyhow::Result<()> {
         columns: image.cols(),
         kind: image.typ(),
         since_boot,
+        time_source,
     };
     protocol::write_line(output, &VideoMessage::Frame(header))?;
     Ok(output.write_all(image.data_bytes()?)?)
@@ -112,10 +120,21 @@ const FALLBACK_FPS: f64 = 25.0;
 /// Maximum time without a message while the next frame of a file is not due.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
+/// Opens a source: motion JPEG over HTTP without OpenCV, which hides the time of a picture.
+fn open(source: &SourceConfig, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
+    if let Some(stream) = MotionJpeg::open(source, timeout)? {
+        return Ok(Box::new(stream));
+    }
+    Ok(Box::new(Video::open(source, timeout)?))
+}
+
 struct Video {
     origin: String,
     pictures: Pictures,
     playback: Option<Playback>,
+    /// Capture times of a live source.
+    clock: CaptureClock,
+    time_source: TimeSource,
     seq: u64,
 }
 
@@ -127,7 +146,7 @@ struct Playback {
     stamps: Option<VideoCapture>,
     looping: bool,
     /// The next frame, until it is due.
-    next: Option<Mat>,
+    next: Option<Picture>,
     /// Time between two messages while the next frame is not due.
     patience: Duration,
 }
@@ -235,6 +254,16 @@ struct Pictures {
     /// True if `capture` returns pictures undecoded. FFmpeg takes damaged ones for whole, or for
     /// the end.
     are_jpeg: bool,
+    /// True if the source states presentation times. FFmpeg counts pictures at an assumed rate for
+    /// streams without, as motion JPEG over HTTP.
+    has_positions: bool,
+}
+
+/// A picture with what the source states about its time.
+struct Picture {
+    image: Mat,
+    stamp: Option<FrameStamp>,
+    arrived_at: Timestamp,
 }
 
 /// Codecs of motion JPEG, by their names in containers and by FFmpeg's.
@@ -251,6 +280,7 @@ impl Pictures {
             capture,
             presentation,
             are_jpeg,
+            has_positions: true,
         })
     }
 
@@ -260,18 +290,28 @@ impl Pictures {
     }
 
     /// The next picture, if there is one.
-    fn next(&mut self) -> opencv::Result<Option<Result<Mat, ImageError>>> {
+    fn next(&mut self) -> opencv::Result<Option<Result<Picture, ImageError>>> {
         let mut read = Mat::default();
         if !self.capture.read(&mut read)? || read.empty() {
             return Ok(None);
         }
+        let arrived_at = clock::now();
+        // Zero without a presentation time, as of undecoded pictures.
+        let position_ms = self.capture.get(videoio::CAP_PROP_POS_MSEC)?;
+        let position = Duration::try_from_secs_f64(position_ms / 1e3)
+            .ok()
+            .filter(|position| self.has_positions && !position.is_zero());
         if self.are_jpeg {
             match image_codec::decode_motion_jpeg(read.data_bytes()?) {
                 Ok(decoded) => read = decoded,
                 Err(damage) => return Ok(Some(Err(damage))),
             }
         }
-        Ok(Some(Ok(self.presentation.apply(read)?)))
+        Ok(Some(Ok(Picture {
+            image: self.presentation.apply(read)?,
+            stamp: position.map(FrameStamp::Position),
+            arrived_at,
+        })))
     }
 }
 
@@ -282,15 +322,21 @@ fn open_file(path: &Path) -> opencv::Result<VideoCapture> {
 impl Video {
     fn open(source: &SourceConfig, timeout: Duration) -> Result<Self, FrameError> {
         let origin = source.origin();
-        match source {
-            SourceConfig::Gstreamer { pipeline } => Self::pipeline(pipeline, origin),
-            SourceConfig::Url { url } => Self::url(url, origin, timeout),
-            SourceConfig::Video { path, looping } => Self::file(path, origin, *looping, timeout),
-            SourceConfig::V4l2 { .. } | SourceConfig::Images { .. } => Err(FrameError::Open {
-                origin,
-                reason: "the node reads it itself".into(),
-            }),
-        }
+        let video = match source {
+            SourceConfig::Gstreamer { pipeline, .. } => Self::pipeline(pipeline, origin)?,
+            SourceConfig::Url { url, .. } => Self::url(url, origin, timeout)?,
+            SourceConfig::Video { path, looping } => Self::file(path, origin, *looping, timeout)?,
+            SourceConfig::V4l2 { .. } | SourceConfig::Images { .. } => {
+                return Err(FrameError::Open {
+                    origin,
+                    reason: "the node reads it itself".into(),
+                });
+            }
+        };
+        Ok(Self {
+            clock: CaptureClock::new(source.latency_s()),
+            ..video
+        })
     }
 
     fn pipeline(pipeline: &str, origin: String) -> Result<Self, FrameError> {
@@ -328,13 +374,15 @@ impl Video {
             .into_iter()
             .flat_map(|property| [property, timeout_ms])
             .collect();
-        Self::live(origin, || {
+        let mut video = Self::live(origin, || {
             VideoCapture::from_file_with_params(
                 url,
                 videoio::CAP_FFMPEG,
                 &Vector::from_slice(&timeouts),
             )
-        })
+        })?;
+        video.pictures.has_positions = url.to_ascii_lowercase().starts_with("rtsp");
+        Ok(video)
     }
 
     fn file(
@@ -388,33 +436,35 @@ impl Video {
             origin,
             pictures,
             playback: None,
+            clock: CaptureClock::new(None),
+            time_source: TimeSource::Playback,
             seq: 0,
         })
     }
 
-    /// The next image, if there is one.
-    fn read(&mut self) -> Result<Option<Mat>, FrameError> {
+    /// The next picture, if there is one.
+    fn read(&mut self) -> Result<Option<Picture>, FrameError> {
         let read = self.pictures.next();
         if let Some(stamps) = self.playback.as_mut().and_then(|p| p.stamps.as_mut()) {
             // False for a picture that FFmpeg cannot decode.
             stamps.grab().map_err(|e| self.lost(e))?;
         }
-        let image = read.map_err(|e| self.lost(e))?.transpose();
-        image.map_err(|damage| FrameError::Unusable {
+        let picture = read.map_err(|e| self.lost(e))?.transpose();
+        picture.map_err(|damage| FrameError::Unusable {
             origin: self.origin.clone(),
             reason: damage.to_string(),
         })
     }
 
-    /// The next image of a file, from its beginning again if it loops.
-    fn read_file(&mut self) -> Result<Option<Mat>, FrameError> {
-        let image = self.read()?;
+    /// The next picture of a file, from its beginning again if it loops.
+    fn read_file(&mut self) -> Result<Option<Picture>, FrameError> {
+        let picture = self.read()?;
         let again = self
             .playback
             .as_ref()
-            .filter(|playback| image.is_none() && playback.looping && self.seq > 0);
+            .filter(|playback| picture.is_none() && playback.looping && self.seq > 0);
         let Some(Playback { path, .. }) = again else {
-            return Ok(image);
+            return Ok(picture);
         };
         let pictures = open_file(path).and_then(Pictures::of);
         let pictures = pictures.map_err(|e| self.lost(e))?;
@@ -439,35 +489,44 @@ impl FrameSource for Video {
         let waiting = self.playback.as_mut().and_then(|p| p.next.take());
         let is_waiting = waiting.is_some();
         let next = match waiting {
-            Some(image) => Some(image),
+            Some(picture) => Some(picture),
             None => self.read_file()?,
         };
         let origin = || self.origin.clone();
-        let image = next.ok_or_else(|| match self.playback {
+        let picture = next.ok_or_else(|| match self.playback {
             Some(_) => FrameError::Ended { origin: origin() },
             None => FrameError::Lost {
                 origin: origin(),
                 reason: "no further frame".into(),
             },
         })?;
-        if let Some(playback) = &mut self.playback {
+        let captured_at = if let Some(playback) = &mut self.playback {
             if !is_waiting {
                 let stamps = playback.stamps.as_ref().unwrap_or(&self.pictures.capture);
                 let stamp_ms = stamps.get(videoio::CAP_PROP_POS_MSEC);
                 playback.pacer.schedule(stamp_ms.unwrap_or_default());
             }
             if !playback.pacer.wait(playback.patience) {
-                playback.next = Some(image);
+                playback.next = Some(picture);
                 return Err(FrameError::NotDue);
             }
-        }
+            clock::now()
+        } else {
+            let time = self.clock.time(picture.stamp, picture.arrived_at);
+            self.time_source = time.source;
+            time.captured_at
+        };
         let frame = CameraFrame {
-            image,
-            captured_at: clock::now(),
+            image: picture.image,
+            captured_at,
             seq: self.seq,
         };
         self.seq += 1;
         Ok(frame)
+    }
+
+    fn time_source(&self) -> TimeSource {
+        self.time_source
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::camera::frame_source::{FrameError, SourceConfig};
+use crate::camera::frame_source::{FrameError, SourceConfig, TimeSource};
 
 /// The first and only line for the program. On a command line, every user of the machine could read
 /// the source's secrets.
@@ -36,6 +36,7 @@ pub(super) struct ImageHeader {
     pub(super) kind: i32,
     /// Time of capture since the boot of the machine.
     pub(super) since_boot: Duration,
+    pub(super) time_source: TimeSource,
 }
 
 pub(super) fn write_line(output: &mut impl Write, message: &impl Serialize) -> io::Result<()> {

@@ -3,9 +3,7 @@ use opencv::core::{CV_8UC3, Scalar};
 use super::*;
 
 fn way(fourcc: &[u8; 4]) -> Way {
-    PixelConversion::choose(&[PixelFormat::from_fourcc(*fourcc)])
-        .unwrap()
-        .way
+    PixelConversion::choose(&[FourCC::new(fourcc)]).unwrap().way
 }
 
 fn convert(fourcc: &[u8; 4], size: [u32; 2], stride: u32, buffer: &[u8]) -> Result<Mat, String> {
@@ -21,7 +19,7 @@ fn cheapest_format_is_chosen() {
     let formats = |names: &[&[u8; 4]]| {
         names
             .iter()
-            .map(|name| PixelFormat::from_fourcc(**name))
+            .map(|name| FourCC::new(name))
             .collect::<Vec<_>>()
     };
     let chosen = |names: &[&[u8; 4]]| {

@@ -1,0 +1,129 @@
+use super::*;
+
+const START: Timestamp = Timestamp(1_700_000_000_000_000);
+const PERIOD: Duration = Duration::from_millis(50);
+
+fn ms(milliseconds: u64) -> Duration {
+    Duration::from_millis(milliseconds)
+}
+
+/// A frame every 50 ms, which takes 30 ms to arrive, and up to 120 ms more.
+struct Frame {
+    position: Duration,
+    captured_at: Timestamp,
+    arrived_at: Timestamp,
+}
+
+fn frames(count: u32) -> impl Iterator<Item = Frame> {
+    (0..count).map(|number| {
+        let position = PERIOD * (number + 1);
+        let captured_at = START + position;
+        Frame {
+            position,
+            captured_at,
+            arrived_at: captured_at + ms(30) + ms(u64::from(number * 7 % 5) * 30),
+        }
+    })
+}
+
+#[test]
+fn late_frame_keeps_stamped_time() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(100) {
+        let time = clock.time(Some(FrameStamp::Time(frame.captured_at)), frame.arrived_at);
+        assert_eq!(time.captured_at, frame.captured_at);
+        assert_eq!(time.source, TimeSource::Stamp);
+    }
+}
+
+#[test]
+fn positions_remove_jitter_of_arrival() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(1000) {
+        let stamp = FrameStamp::Position(frame.position);
+        let time = clock.time(Some(stamp), frame.arrived_at);
+        assert_eq!(time.captured_at, frame.captured_at + ms(30));
+        assert_eq!(time.source, TimeSource::Position);
+    }
+}
+
+#[test]
+fn wrong_camera_clock_gives_spacing_only() {
+    for wrong_s in [-86_400.0, -1.2, 0.1, 3600.0] {
+        let mut clock = CaptureClock::new(None);
+        for frame in frames(100) {
+            let stated = frame.captured_at.shifted((wrong_s * 1e6) as i64);
+            let time = clock.time(Some(FrameStamp::Time(stated)), frame.arrived_at);
+            assert_eq!(time.captured_at, frame.captured_at + ms(30), "{wrong_s}");
+            assert_eq!(time.source, TimeSource::Position);
+        }
+    }
+}
+
+#[test]
+fn configured_latency_replaces_stated_one() {
+    let mut clocks = [(); 3].map(|()| CaptureClock::new(Some(0.2)));
+    for frame in frames(100) {
+        let stamps = [
+            Some(FrameStamp::Time(frame.captured_at)),
+            Some(FrameStamp::Position(frame.position)),
+            None,
+        ];
+        let [time, position, none] =
+            [0, 1, 2].map(|i| clocks[i].time(stamps[i], frame.arrived_at).captured_at);
+        assert_eq!(time, frame.captured_at + ms(30) - ms(200));
+        assert_eq!(position, time);
+        assert_eq!(none, frame.arrived_at - ms(200));
+    }
+}
+
+#[test]
+fn clock_without_progress_gives_arrival() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(100) {
+        let time = clock.time(Some(FrameStamp::Position(ms(7))), frame.arrived_at);
+        assert_eq!(time.captured_at, frame.arrived_at);
+    }
+}
+
+#[test]
+fn restarted_positions_start_anew() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(100) {
+        clock.time(
+            Some(FrameStamp::Position(frame.position + ms(9_000))),
+            frame.arrived_at,
+        );
+    }
+    for frame in frames(100) {
+        let arrived_at = frame.arrived_at + ms(60_000);
+        let time = clock.time(Some(FrameStamp::Position(frame.position)), arrived_at);
+        assert_eq!(time.captured_at, frame.captured_at + ms(60_030));
+    }
+}
+
+#[test]
+fn drifting_camera_clock_is_followed() {
+    for drift in [-1e-4, 1e-4] {
+        let mut clock = CaptureClock::new(None);
+        let mut worst_us = 0;
+        for frame in frames(20 * 3600) {
+            let stamp = FrameStamp::Position(frame.position.mul_f64(1.0 + drift));
+            let time = clock.time(Some(stamp), frame.arrived_at);
+            let error_us = time.captured_at.micros_from(frame.captured_at + ms(30));
+            worst_us = error_us.abs().max(worst_us);
+        }
+        assert!(worst_us < 2500, "{worst_us} us at {drift}");
+    }
+}
+
+#[test]
+fn slow_positions_err_by_a_second() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(1000) {
+        let stamp = FrameStamp::Position(frame.position.mul_f64(0.4));
+        let time = clock.time(Some(stamp), frame.arrived_at);
+        let early = frame.arrived_at.since(time.captured_at);
+        assert!(early <= MAX_DELAY, "{early:?}");
+    }
+}

@@ -1,0 +1,275 @@
+//! Motion JPEG over HTTP, the protocol of many network cameras: a response that does not end, with
+//! one part for each picture (`multipart/x-mixed-replace`).
+//!
+//! FFmpeg reads such streams, too, but hides the time of capture in a part's header, `X-Timestamp`.
+//! Whatever this reader does not support is left to FFmpeg: `https://`, redirects, other
+//! authentication than Basic, parts without a length.
+
+use std::time::Duration;
+
+use anyhow::{Context, bail, ensure};
+use axum::body::{Body, BodyDataStream};
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use ecod::model::time::Timestamp;
+use futures_util::StreamExt;
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, WWW_AUTHENTICATE};
+use hyper::{Request, Response, StatusCode, Uri};
+use hyper_util::rt::TokioIo;
+use percent_encoding::percent_decode_str;
+use tokio::net::TcpStream;
+use tokio::runtime::{self, Runtime};
+
+use crate::camera::frame::CameraFrame;
+use crate::camera::frame_source::capture_clock::{CaptureClock, FrameStamp};
+use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig, TimeSource};
+use crate::camera::image_codec;
+use crate::platform::clock;
+
+/// Maximum length of a line of a part's header in bytes.
+const MAX_LINE: usize = 4096;
+
+/// Maximum length of a picture in bytes.
+const MAX_PICTURE: usize = 32 << 20;
+
+/// An open stream.
+pub(super) struct MotionJpeg {
+    origin: String,
+    runtime: Runtime,
+    parts: Parts,
+    /// The first part, which [`MotionJpeg::open`] has read.
+    first: Option<Part>,
+    timeout: Duration,
+    clock: CaptureClock,
+    time_source: TimeSource,
+    seq: u64,
+}
+
+impl MotionJpeg {
+    /// Opens a source; `None` if it is not a stream that this reader supports.
+    pub(super) fn open(
+        source: &SourceConfig,
+        timeout: Duration,
+    ) -> Result<Option<Self>, FrameError> {
+        let SourceConfig::Url { url, latency_s } = source else {
+            return Ok(None);
+        };
+        let Some(address) = Address::of(url) else {
+            return Ok(None);
+        };
+        let failed = |reason: String| FrameError::Open {
+            origin: source.origin(),
+            reason,
+        };
+        let runtime = runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .map_err(|error| failed(error.to_string()))?;
+        let opened = runtime.block_on(async {
+            tokio::time::timeout(timeout, async {
+                let mut parts = address.open().await?;
+                let first = parts.next().await?;
+                anyhow::Ok((parts, first))
+            })
+            .await
+        });
+        match opened {
+            Ok(Ok((parts, first))) => Ok(Some(Self {
+                origin: source.origin(),
+                runtime,
+                parts,
+                first: Some(first),
+                timeout,
+                clock: CaptureClock::new(*latency_s),
+                time_source: TimeSource::Arrival,
+                seq: 0,
+            })),
+            Ok(Err(error)) => {
+                eprintln!("left to FFmpeg: {error:#}");
+                Ok(None)
+            }
+            Err(_) => Err(failed(format!("no picture within {timeout:?}"))),
+        }
+    }
+
+    fn next_part(&mut self) -> Result<Part, FrameError> {
+        if let Some(first) = self.first.take() {
+            return Ok(first);
+        }
+        let parts = &mut self.parts;
+        let timeout = self.timeout;
+        let next = async { tokio::time::timeout(timeout, parts.next()).await };
+        match self.runtime.block_on(next) {
+            Ok(Ok(part)) => Ok(part),
+            Ok(Err(error)) => Err(FrameError::Lost {
+                origin: self.origin.clone(),
+                reason: format!("{error:#}"),
+            }),
+            Err(_) => Err(FrameError::Stalled(self.timeout)),
+        }
+    }
+}
+
+impl FrameSource for MotionJpeg {
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
+        let part = self.next_part()?;
+        let image =
+            image_codec::decode_motion_jpeg(&part.jpeg).map_err(|damage| FrameError::Unusable {
+                origin: self.origin.clone(),
+                reason: damage.to_string(),
+            })?;
+        let time = self.clock.time(part.stamp, part.arrived_at);
+        self.time_source = time.source;
+        let frame = CameraFrame {
+            image,
+            captured_at: time.captured_at,
+            seq: self.seq,
+        };
+        self.seq += 1;
+        Ok(frame)
+    }
+
+    fn time_source(&self) -> TimeSource {
+        self.time_source
+    }
+}
+
+/// Address of a stream and the login for it.
+struct Address {
+    uri: Uri,
+    /// User and password, joined by a colon.
+    login: Option<String>,
+}
+
+impl Address {
+    /// `None` if the address has another scheme than `http://`.
+    fn of(url: &str) -> Option<Self> {
+        let uri: Uri = url.parse().ok()?;
+        if uri.scheme_str()? != "http" {
+            return None;
+        }
+        let authority = uri.authority()?.as_str();
+        let login = match authority.rsplit_once('@') {
+            Some((login, _)) => Some(percent_decode_str(login).decode_utf8().ok()?.into_owned()),
+            None => None,
+        };
+        Some(Self { uri, login })
+    }
+
+    /// Requests the stream, with the login only if the camera requires it.
+    async fn open(&self) -> anyhow::Result<Parts> {
+        let mut response = self.request(None).await?;
+        if response.status() == StatusCode::UNAUTHORIZED {
+            let challenge = response.headers().get(WWW_AUTHENTICATE);
+            let is_basic = challenge.is_some_and(|it| it.as_bytes().starts_with(b"Basic"));
+            let login = self.login.as_deref().filter(|_| is_basic);
+            response = self.request(Some(login.context("no Basic login")?)).await?;
+        }
+        ensure!(response.status() == StatusCode::OK, "{}", response.status());
+        let content = response.headers().get(CONTENT_TYPE);
+        let content = content.and_then(|content| content.to_str().ok());
+        ensure!(
+            content.is_some_and(|content| content.starts_with("multipart/x-mixed-replace")),
+            "content {content:?}"
+        );
+        Ok(Parts {
+            body: response.into_body().into_data_stream(),
+            buffer: Vec::new(),
+        })
+    }
+
+    async fn request(&self, login: Option<&str>) -> anyhow::Result<Response<Body>> {
+        let host = self.uri.host().context("no host")?;
+        let port = self.uri.port_u16().unwrap_or(80);
+        let stream = TcpStream::connect((host.trim_matches(['[', ']']), port)).await?;
+        let (mut sender, connection) =
+            hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
+        // An error of the connection ends the body of the response.
+        tokio::spawn(async { connection.await.unwrap_or_default() });
+        let path = self.uri.path_and_query().map_or("/", |path| path.as_str());
+        let mut request = Request::get(path).header(HOST, format!("{host}:{port}"));
+        if let Some(login) = login {
+            let encoded = BASE64_STANDARD.encode(login);
+            request = request.header(AUTHORIZATION, format!("Basic {encoded}"));
+        }
+        let response = sender.send_request(request.body(Body::empty())?).await?;
+        Ok(response.map(Body::new))
+    }
+}
+
+/// One picture of the stream.
+struct Part {
+    jpeg: Vec<u8>,
+    stamp: Option<FrameStamp>,
+    /// Time when the end of the header arrived.
+    arrived_at: Timestamp,
+}
+
+/// The parts of a response.
+struct Parts {
+    body: BodyDataStream,
+    /// Bytes of the response that have been received and not yet used.
+    buffer: Vec<u8>,
+}
+
+impl Parts {
+    async fn next(&mut self) -> anyhow::Result<Part> {
+        while !self.line().await?.starts_with("--") {}
+        let mut length = None;
+        let mut stamp = None;
+        loop {
+            let line = self.line().await?;
+            if line.is_empty() {
+                break;
+            }
+            let (name, value) = line.split_once(':').context("no header of a part")?;
+            match name.to_ascii_lowercase().as_str() {
+                "content-length" => length = value.trim().parse().ok(),
+                "x-timestamp" => stamp = time_of_camera(value.trim()),
+                _ => {}
+            }
+        }
+        let arrived_at = clock::now();
+        let length = length.context("no length of a part")?;
+        ensure!(length <= MAX_PICTURE, "a picture of {length} bytes");
+        while self.buffer.len() < length {
+            self.receive().await?;
+        }
+        let rest = self.buffer.split_off(length);
+        Ok(Part {
+            jpeg: std::mem::replace(&mut self.buffer, rest),
+            stamp,
+            arrived_at,
+        })
+    }
+
+    /// The next line without its end.
+    async fn line(&mut self) -> anyhow::Result<String> {
+        loop {
+            if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
+                let line: Vec<u8> = self.buffer.drain(..=end).collect();
+                return Ok(String::from_utf8_lossy(&line).trim_end().to_owned());
+            }
+            ensure!(
+                self.buffer.len() < MAX_LINE,
+                "a line of a header is too long"
+            );
+            self.receive().await?;
+        }
+    }
+
+    async fn receive(&mut self) -> anyhow::Result<()> {
+        match self.body.next().await {
+            Some(bytes) => self.buffer.extend_from_slice(&bytes?),
+            None => bail!("no further frame"),
+        }
+        Ok(())
+    }
+}
+
+/// The time in a header `X-Timestamp`, seconds since 1970 with a fraction, on the node's clock.
+fn time_of_camera(seconds: &str) -> Option<FrameStamp> {
+    let since_1970 = Duration::try_from_secs_f64(seconds.parse().ok()?).ok()?;
+    let wall = Timestamp::default() + since_1970;
+    Some(FrameStamp::Time(wall.shifted(-clock::wall_offset_us())))
+}
