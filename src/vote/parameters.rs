@@ -2,7 +2,7 @@
 //! [`WeightedConfig`](super::config::WeightedConfig).
 //!
 //! The table shows what happens when a constant is halved or doubled: the change of the mean accuracy
-//! on 13 public label sets, online or with passes, and the largest change on one of them; and the
+//! on 13 public label sets, online or with passes, and the largest change on a set; and the
 //! change for the worst seed where 1 to 7 of 3 to 15 vehicles are faulty in six ways. All other
 //! constants change both means by at most 0.1 points. The label sets have no confidences and cannot
 //! show the effect of the constants about them.
