@@ -46,56 +46,40 @@ pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 /// Minimum number of observations before a vehicle's statement is judged.
 const MIN_JUDGED_OBSERVATIONS: u32 = 5;
 
-/// Results of a vehicle's observations of an object: the last result, and the number of equal results in a row.
+/// Results of a vehicle's observations of an object so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum ObservationState {
     /// The vehicle has not observed the place yet.
     #[default]
     First,
-    /// The vehicle has observed the place so many times without a detection.
-    Never(u8),
-    /// So many last observations were detections.
-    Hit(u8),
-    /// So many last observations were misses, after an earlier detection.
-    Miss(u8),
+    /// The vehicle has observed the place without a detection so far.
+    Never,
+    /// The last observation was a detection.
+    Hit,
+    /// The last observation was a miss, after an earlier detection.
+    Miss,
 }
 
 impl ObservationState {
-    const COUNT: usize = 1 + 3 * Self::RUNS;
-
-    /// Number of classes of runs by length: 1, 2 to 3, and longer.
-    const RUNS: usize = 3;
+    const COUNT: usize = 4;
 
     /// The state after another observation.
     fn after(self, is_hit: bool) -> Self {
         match (self, is_hit) {
-            (Self::Hit(run), true) => Self::Hit(run.saturating_add(1)),
-            (_, true) => Self::Hit(1),
-            (Self::First, false) => Self::Never(1),
-            (Self::Never(run), false) => Self::Never(run.saturating_add(1)),
-            (Self::Hit(_), false) => Self::Miss(1),
-            (Self::Miss(run), false) => Self::Miss(run.saturating_add(1)),
+            (_, true) => Self::Hit,
+            (Self::First | Self::Never, false) => Self::Never,
+            (Self::Hit | Self::Miss, false) => Self::Miss,
         }
     }
 
     /// True if the last observation was a detection.
     pub(super) fn is_hit(self) -> bool {
-        matches!(self, Self::Hit(_))
+        self == Self::Hit
     }
 
     /// Index into tables of all states.
     fn index(self) -> usize {
-        let of_run = |run: u8| match run {
-            0 | 1 => 0,
-            2 | 3 => 1,
-            _ => 2,
-        };
-        match self {
-            Self::First => 0,
-            Self::Never(run) => 1 + of_run(run),
-            Self::Hit(run) => 1 + Self::RUNS + of_run(run),
-            Self::Miss(run) => 1 + 2 * Self::RUNS + of_run(run),
-        }
+        self as usize
     }
 }
 
@@ -121,12 +105,12 @@ impl DetectionRates {
 
     /// Usual rates of objects.
     pub(super) fn object() -> Self {
-        Self::usual([0.5, 0.2, 0.1, 0.05, 0.85, 0.9, 0.95, 0.4, 0.3, 0.15])
+        Self::usual([0.5, 0.2, 0.85, 0.4])
     }
 
     /// Usual rates of clutter.
     pub(super) fn clutter() -> Self {
-        Self::usual([0.05, 0.03, 0.02, 0.01, 0.15, 0.5, 0.6, 0.1, 0.05, 0.02])
+        Self::usual([0.05, 0.03, 0.15, 0.1])
     }
 
     /// The rate at an observation in this state.

@@ -54,7 +54,7 @@ pub(super) fn merge(
             let sensor = sensors.get(history.sensor);
             sensor
                 .and_then(|sensor| sensor.coverage.rates_at(&history.position))
-                .map_or(UNKNOWN_RATE, |rates| rates.rate(ObservationState::Hit(1)))
+                .map_or(UNKNOWN_RATE, |rates| rates.rate(ObservationState::Hit))
         };
         let mut twins = std::mem::take(&mut tracks[older].twins);
         let other = &tracks[later];

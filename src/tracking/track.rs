@@ -275,11 +275,20 @@ impl Track {
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);
         }
-        let Some(denied) = self.denied_nats(at, trust) else {
+        let Some(denied) = self.denied_nats(at, &trust) else {
             return logistic(observations + confidences);
         };
-        // The cause of a false detection persists, so repeated detections by one vehicle are not independent.
-        let sole = observations.min(SOLE_NATS) + confidences;
+        // The cause of a false detection persists, so repeated detections by one vehicle are not independent. The limit
+        // falls with the vehicle's weight.
+        let detecting = self
+            .history
+            .iter()
+            .filter(|history| history.last_hit.is_some());
+        let witness = detecting
+            .map(|history| trust(history.sensor))
+            .reduce(f64::max)
+            .unwrap_or(1.0);
+        let sole = observations.min(SOLE_NATS * witness) + confidences;
         if denied < 0.0 {
             logistic(sole.min(MAX_DENIED_NATS) + denied)
         } else {
