@@ -17,6 +17,7 @@ mod config;
 mod coverage;
 mod detection_history;
 mod existence;
+mod fading_mean;
 mod gauge;
 mod grid;
 mod handles;

@@ -4,6 +4,8 @@
 //! probability follows from observations alone, so that confidences do not confirm themselves. Without evidence, a
 //! confidence is the probability that it states, relative to `even_confidence`.
 
+use super::fading_mean::FadingMean;
+
 /// Estimated relation between confidence and evidence of one vehicle.
 #[derive(Debug, Clone)]
 pub(super) struct DetectionCalibration {
@@ -19,9 +21,6 @@ const MIN_NATS: f64 = -4.8;
 
 /// Number of detections as which the prior counts in each bin.
 const PRIOR: f64 = 4.0;
-
-/// Number of detections beyond which earlier ones are discounted.
-const MEMORY: f64 = 4000.0;
 
 /// Maximum evidence of one confidence, nats.
 const MAX_NATS: f64 = 4.0;
@@ -65,7 +64,7 @@ impl DetectionCalibration {
         self.objects[bin] += probability;
         self.clutter[bin] += 1.0 - probability;
         let total: f64 = self.objects.iter().chain(&self.clutter).sum();
-        let kept = (MEMORY / total).min(1.0);
+        let kept = (FadingMean::MEMORY / total).min(1.0);
         if kept < 1.0 {
             let all = self.objects.iter_mut().chain(&mut self.clutter);
             all.for_each(|count| *count *= kept);

@@ -16,6 +16,7 @@ use std::time::Duration;
 use nalgebra::Vector2;
 
 use super::attributes::StatedAttributes;
+use super::fading_mean::FadingMean;
 use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
@@ -86,20 +87,17 @@ impl ObservationState {
 /// Probability of a detection at an observation, by the state before it, estimated as the mean of a beta distribution.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DetectionRates {
-    /// Numbers of detections and of observations.
-    counts: [(f64, f64); ObservationState::COUNT],
+    /// Share of observations that were detections.
+    shares: [FadingMean; ObservationState::COUNT],
 }
 
 impl DetectionRates {
     /// Number of observations as which the usual rates count.
     const USUAL_OBSERVATIONS: f64 = 10.0;
 
-    /// Number of observations beyond which earlier observations are discounted.
-    const MEMORY: f64 = 400.0;
-
     fn usual(rates: [f64; ObservationState::COUNT]) -> Self {
         Self {
-            counts: rates.map(|rate| (rate * Self::USUAL_OBSERVATIONS, Self::USUAL_OBSERVATIONS)),
+            shares: rates.map(|rate| FadingMean::new(rate, Self::USUAL_OBSERVATIONS)),
         }
     }
 
@@ -115,18 +113,12 @@ impl DetectionRates {
 
     /// The rate at an observation in this state.
     pub(super) fn rate(&self, state: ObservationState) -> f64 {
-        let (hits, observations) = self.counts[state.index()];
-        (hits / observations).clamp(0.01, 0.985)
+        self.shares[state.index()].mean().clamp(0.01, 0.985)
     }
 
     /// Updates the mean with an observation of a weight, 0 to 1.
     pub(super) fn learn(&mut self, state: ObservationState, is_hit: bool, weight: f64) {
-        let (hits, observations) = &mut self.counts[state.index()];
-        *hits += weight * f64::from(u8::from(is_hit));
-        *observations += weight;
-        let kept = (Self::MEMORY / *observations).min(1.0);
-        *hits *= kept;
-        *observations *= kept;
+        self.shares[state.index()].count(is_hit, weight);
     }
 }
 

@@ -1,22 +1,10 @@
 //! Births and departures of objects, estimated from the tracks.
 
-/// Share of the tracks begun by one vehicle that become objects.
-#[derive(Debug, Clone)]
-pub(super) struct Births {
-    /// Tracks that became objects.
-    objects: f64,
-    /// Tracks that ended before they became objects.
-    clutter: f64,
-}
+use super::fading_mean::FadingMean;
 
-impl Default for Births {
-    fn default() -> Self {
-        Self {
-            objects: Self::USUAL_SHARE * Self::USUAL,
-            clutter: (1.0 - Self::USUAL_SHARE) * Self::USUAL,
-        }
-    }
-}
+/// Share of the tracks begun by one vehicle that become objects.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Births(FadingMean);
 
 impl Births {
     /// Usual share of new tracks that become objects.
@@ -25,24 +13,15 @@ impl Births {
     /// Number of births as which the usual share counts.
     const USUAL: f64 = 4.0;
 
-    /// Number of births beyond which earlier births are discounted.
-    const MAX: f64 = 400.0;
-
     /// Log-odds that a new track is an object.
     pub(super) fn log_odds(&self) -> f64 {
-        (self.objects / self.clutter).ln().clamp(-4.0, 3.0)
+        let share = self.0.mean_with(Self::USUAL_SHARE, Self::USUAL);
+        (share / (1.0 - share)).ln()
     }
 
     /// Counts a new track that became an object or turned out to be clutter.
     pub(super) fn settle(&mut self, is_object: bool) {
-        if is_object {
-            self.objects += 1.0;
-        } else {
-            self.clutter += 1.0;
-        }
-        let kept = (Self::MAX / (self.objects + self.clutter)).min(1.0);
-        self.objects *= kept;
-        self.clutter *= kept;
+        self.0.count(is_object, 1.0);
     }
 }
 

@@ -10,6 +10,7 @@ use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
 use super::existence::{DetectionRates, ObservationRates, ObservationState};
+use super::fading_mean::FadingMean;
 use super::handles::SensorId;
 use super::population::{Births, Population};
 use super::pose_bias::PoseBias;
@@ -331,41 +332,15 @@ impl SensorModel {
 /// Without reported covariances, the variances themselves are estimated, from a prior that grows with the distance.
 #[derive(Debug, Clone, Default)]
 pub(super) struct NoiseModel {
-    scale: Learnt,
+    scale: FadingMean,
     bins: [NoiseBin; Self::BINS],
 }
 
 /// Variances at one distance, m².
 #[derive(Debug, Clone, Copy, Default)]
 struct NoiseBin {
-    along: Learnt,
-    across: Learnt,
-}
-
-/// Sum and number of the latest values.
-#[derive(Debug, Clone, Copy, Default)]
-struct Learnt {
-    sum: f64,
-    count: f64,
-}
-
-impl Learnt {
-    /// Number of values as which a prior counts, and beyond which older values are discounted.
-    const PRIOR: f64 = 30.0;
-    const MEMORY: f64 = 500.0;
-
-    /// The mean of the values and a prior.
-    fn mean(&self, prior: f64) -> f64 {
-        (prior * Self::PRIOR + self.sum) / (Self::PRIOR + self.count)
-    }
-
-    fn learn(&mut self, value: f64) {
-        self.sum += value;
-        self.count += 1.0;
-        let kept = (Self::MEMORY / self.count).min(1.0);
-        self.sum *= kept;
-        self.count *= kept;
-    }
+    along: FadingMean,
+    across: FadingMean,
 }
 
 /// Residual of a detection from its track.
@@ -382,6 +357,9 @@ impl NoiseModel {
     const BINS: usize = 6;
     const BIN_M: f64 = 10.0;
 
+    /// Number of residuals as which the prior counts.
+    const PRIOR: f64 = 30.0;
+
     /// Increase of the prior's standard deviation with the distance, and the share of it across the line of sight.
     const PER_METRE: f64 = 0.012;
     const ACROSS: f64 = 0.5;
@@ -393,7 +371,10 @@ impl NoiseModel {
     fn variances(&self, distance_m: f64, config: &TracksConfig) -> [f64; 2] {
         let prior = |share: f64| (config.noise_m + share * Self::PER_METRE * distance_m).powi(2);
         let NoiseBin { along, across } = &self.bins[Self::bin(distance_m)];
-        [along.mean(prior(1.0)), across.mean(prior(Self::ACROSS))]
+        [
+            along.mean_with(prior(1.0), Self::PRIOR),
+            across.mean_with(prior(Self::ACROSS), Self::PRIOR),
+        ]
     }
 
     fn bin(distance_m: f64) -> usize {
@@ -402,7 +383,7 @@ impl NoiseModel {
 
     /// Ratio of the squared residuals to the stated covariance, which is a lower bound.
     fn scale(&self) -> f64 {
-        self.scale.mean(1.0).max(1.0)
+        self.scale.mean_with(1.0, Self::PRIOR).max(1.0)
     }
 
     /// Covariance of a reported position, m², of a vehicle at `origin`.
@@ -442,7 +423,7 @@ impl NoiseModel {
             let stated = (stated.xx + stated.yy) / 2.0;
             let squared = bounded(offset.norm_squared() / 2.0, self.scale() * stated);
             if stated > 0.0 {
-                self.scale.learn(squared / stated);
+                self.scale.add(squared / stated, 1.0);
             }
             return;
         }
@@ -454,8 +435,8 @@ impl NoiseModel {
         };
         let variances = self.variances(distance_m, config);
         let NoiseBin { along, across } = &mut self.bins[Self::bin(distance_m)];
-        along.learn(bounded(squares[0], variances[0]));
-        across.learn(bounded(squares[1], variances[1]));
+        along.add(bounded(squares[0], variances[0]), 1.0);
+        across.add(bounded(squares[1], variances[1]), 1.0);
     }
 }
 

@@ -10,6 +10,7 @@ use std::collections::BTreeMap;
 
 use super::detection_history::DetectionHistory;
 use super::existence::{ExistenceStatement, JUDGED_AFTER};
+use super::fading_mean::FadingMean;
 use super::handles::SensorId;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -199,14 +200,13 @@ pub(super) struct Fleet {
     reputation: ReputationConfig,
     /// Weight of the evidence of each vehicle by its id, 0 to 1.
     trust: Vec<f64>,
-    /// By distance, the number of vehicles that detected an existing object, and of all vehicles.
-    detections: Vec<(f64, f64)>,
+    /// By distance, the share of vehicles that detected an existing object.
+    detections: Vec<FadingMean>,
 }
 
 impl Fleet {
     const BIN_M: f64 = 10.0;
     const BINS: usize = 16;
-    const MEMORY: f64 = 500.0;
 
     /// Minimum weight of a bin from which detections are expected.
     const MIN_WEIGHT: f64 = 10.0;
@@ -216,7 +216,7 @@ impl Fleet {
         Self {
             reputation,
             trust: Vec::new(),
-            detections: vec![(0.0, 1.0); Self::BINS],
+            detections: vec![FadingMean::new(0.0, 1.0); Self::BINS],
         }
     }
 
@@ -282,18 +282,13 @@ impl Fleet {
     }
 
     fn learn(&mut self, distance_m: f64, is_detected: bool) {
-        let (detections, all) = &mut self.detections[Self::bin(distance_m)];
-        *detections += f64::from(u8::from(is_detected));
-        *all += 1.0;
-        let kept = (Self::MEMORY / *all).min(1.0);
-        *detections *= kept;
-        *all *= kept;
+        self.detections[Self::bin(distance_m)].count(is_detected, 1.0);
     }
 
     /// Whether most vehicles detect objects at a distance.
     fn expects(&self, distance_m: f64) -> bool {
-        let (detections, all) = self.detections[Self::bin(distance_m)];
-        all >= Self::MIN_WEIGHT && detections / all >= MIN_EXPECTED
+        let detections = &self.detections[Self::bin(distance_m)];
+        detections.weight() >= Self::MIN_WEIGHT && detections.mean() >= MIN_EXPECTED
     }
 
     fn bin(distance_m: f64) -> usize {
