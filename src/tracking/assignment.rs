@@ -60,7 +60,7 @@ const MAX_TRACKS_NEAR: usize = 64;
 const MAX_PAIRS: usize = 20_000;
 
 /// Probability of a detection by a vehicle whose view is unknown.
-const UNKNOWN_RATE: f64 = 0.5;
+pub(super) const UNKNOWN_RATE: f64 = 0.5;
 
 /// A possible cause of detections of this instant.
 #[derive(Debug)]
@@ -379,7 +379,7 @@ impl<'a> Assignment<'a> {
             }
             None => (NEW_EXISTENCE * rate(ObservationState::First), 1.0),
         };
-        let odds = detected.max(MIN_DETECTED) / (1.0 - detected).max(0.02);
+        let odds = detected.max(MIN_DETECTED) / (1.0 - detected);
         let new_per_m2 = detection.class.new_per_m2;
         let density = TAU * covariance.determinant().sqrt() * new_per_m2;
         let benefit = (odds * similarity / density).ln() - distance_squared / 2.0;

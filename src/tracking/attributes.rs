@@ -17,7 +17,7 @@ use crate::wire::PerceivedObject;
 const MAX_LABELS: usize = 8;
 
 /// Share of earlier readings that remains after a reading.
-const KEPT: f64 = 0.95;
+pub(super) const KEPT: f64 = 0.95;
 
 /// Share of a new value in a vehicle's heading: a car turns within a second.
 const HEADING_SHARE: f64 = 0.5;

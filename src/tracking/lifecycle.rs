@@ -6,6 +6,7 @@ use std::time::Duration;
 use nalgebra::Vector2;
 use uuid::Uuid;
 
+use super::assignment::UNKNOWN_RATE;
 use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::existence::{ObservationState, SensorHistory};
@@ -30,9 +31,6 @@ const MAX_NEAR_EACH: usize = 32;
 
 /// Maximum distance of two tracks of one object in standard deviations.
 const MERGE_SIGMAS: f64 = 3.0;
-
-/// Probability of a detection by a vehicle whose view is unknown.
-const UNKNOWN_RATE: f64 = 0.9;
 
 /// Time for which a silent vehicle is kept after its last object.
 const REMEMBERED: Duration = Duration::from_secs(10);

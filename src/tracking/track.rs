@@ -20,13 +20,7 @@ use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, PerceivedObject};
 
-/// Maximum age of another vehicle's detection that confirms a track.
-const CONFIRMED_WITHIN: Duration = Duration::from_secs(1);
-
-/// Share of the weight of labels from another aggregator's map that remains after an instant with a detection.
-const INHERITED_KEPT: f64 = 0.95;
-
-/// Weight below which such a label is dropped.
+/// Weight below which a label from another aggregator's map is dropped.
 const MIN_INHERITED: f64 = 1e-3;
 
 /// Similarity to a label without any reading.
@@ -164,7 +158,7 @@ impl Track {
         let size_m = attributes::size_m(stated());
         for (label, weight) in &mut self.inherited_labels {
             attributes::add(&mut labels, label, *weight);
-            *weight *= INHERITED_KEPT;
+            *weight *= attributes::KEPT;
         }
         self.inherited_labels
             .retain(|(_, weight)| *weight >= MIN_INHERITED);
@@ -341,7 +335,7 @@ impl Track {
 
     /// Whether a vehicle other than `sensor` detected the object shortly before `at`.
     pub(super) fn is_seen_by_others(&self, sensor: SensorId, at: Timestamp) -> bool {
-        self.seen_by(at - CONFIRMED_WITHIN)
+        self.seen_by(at - DETECTED_WITHIN)
             .any(|history| history.sensor != sensor)
     }
 
