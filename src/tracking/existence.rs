@@ -103,12 +103,12 @@ impl DetectionRates {
 
     /// Usual rates of objects.
     pub(super) fn object() -> Self {
-        Self::usual([0.5, 0.2, 0.85, 0.4])
+        Self::usual([0.5, 0.15, 0.85, 0.4])
     }
 
     /// Usual rates of clutter.
     pub(super) fn clutter() -> Self {
-        Self::usual([0.05, 0.03, 0.15, 0.1])
+        Self::usual([0.05, 0.025, 0.15, 0.1])
     }
 
     /// The rate at an observation in this state.
