@@ -33,6 +33,7 @@ impl FadingMean {
         self.add(f64::from(u8::from(is_positive)), weight);
     }
 
+    /// The mean of at least one value.
     pub(super) fn mean(&self) -> f64 {
         self.sum / self.weight
     }

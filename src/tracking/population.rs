@@ -13,10 +13,13 @@ impl Births {
     /// Number of births as which the usual share counts.
     const USUAL: f64 = 4.0;
 
+    /// Maximum log-odds: a good record does not make the first detection of an object sure.
+    const MAX_NATS: f64 = 3.0;
+
     /// Log-odds that a new track is an object.
     pub(super) fn log_odds(&self) -> f64 {
         let share = self.0.mean_with(Self::USUAL_SHARE, Self::USUAL);
-        (share / (1.0 - share)).ln()
+        (share / (1.0 - share)).ln().min(Self::MAX_NATS)
     }
 
     /// Counts a new track that became an object or turned out to be clutter.

@@ -4,7 +4,8 @@
 use std::collections::BTreeSet;
 
 use super::parameters::{
-    BAND_NOISE, BAND_PRIOR_VOTES, BANDS, CONFIDENCE_WEIGHTS, LONG_MEMORY_VOTES, RANK_PRIOR_VOTES,
+    BAND_NOISE, BAND_PRIOR_VOTES, BANDS, LONG_MEMORY, MAX_CONFIDENCE_WEIGHT, MIN_CONFIDENCE_WEIGHT,
+    RANK_PRIOR_VOTES,
 };
 
 /// Bins of the histogram of a vehicle's confidences.
@@ -120,7 +121,7 @@ impl ConfidenceCalibration {
 
     /// Counts a settled vote.
     pub(super) fn settle(&mut self, band: Band, agreement: f64) {
-        self.settled.fade(1.0 - 1.0 / LONG_MEMORY_VOTES);
+        self.settled.fade(1.0 - 1.0 / LONG_MEMORY);
         self.settled.add(band, agreement, 1.0);
     }
 
@@ -156,7 +157,7 @@ impl ConfidenceCalibration {
             for (agreed, votes, width) in pools {
                 let ratio = 1.0 + kept * (shrunk(agreed, votes) / overall - 1.0);
                 ratios[band..band + width]
-                    .fill(ratio.clamp(CONFIDENCE_WEIGHTS.0, CONFIDENCE_WEIGHTS.1));
+                    .fill(ratio.clamp(MIN_CONFIDENCE_WEIGHT, MAX_CONFIDENCE_WEIGHT));
                 band += width;
             }
         }
@@ -227,9 +228,8 @@ impl Weights {
     /// Weight of a vote of the stated confidence; 1 when all votes have the same confidence.
     pub(super) fn of(&self, band: Band, confidence: f64) -> f64 {
         let n = self.votes;
-        let (low, high) = CONFIDENCE_WEIGHTS;
         let stated = if self.mean > 0.0 {
-            (confidence / self.mean).clamp(low, high)
+            (confidence / self.mean).clamp(MIN_CONFIDENCE_WEIGHT, MAX_CONFIDENCE_WEIGHT)
         } else {
             1.0
         };

@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 
 use super::index_map::{IndexMap, LabelIndex};
 use super::parameters::{
-    ITERATIONS, LONG_MEMORY_VOTES, MAX_COMPARED, PRIOR_COMPARISONS, SAME_GROUP, SELF_SUPPORT,
+    ITERATIONS, LONG_MEMORY, MAX_COMPARED, PRIOR_COMPARISONS, SAME_GROUP, SELF_SUPPORT,
     SIGNIFICANCE, TENURE_VOTES,
 };
 
@@ -195,14 +195,14 @@ impl Dependence {
         self.compared += 1;
     }
 
-    /// Counts a stated label for the chance agreement. The sums are halved at [`LONG_MEMORY_VOTES`], so
+    /// Counts a stated label for the chance agreement. The sums are halved at [`LONG_MEMORY`], so
     /// that old labels fade.
     fn count_label(&mut self, label: LabelIndex) {
         let label = usize::from(label);
         if self.stated.len() <= label {
             self.stated.resize(label + 1, 0.0);
         }
-        if self.total >= LONG_MEMORY_VOTES {
+        if self.total >= LONG_MEMORY {
             self.stated.iter_mut().for_each(|n| *n /= 2.0);
             self.total /= 2.0;
             self.squares /= 4.0;

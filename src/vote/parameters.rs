@@ -1,5 +1,6 @@
-//! Parameters of the default mode: one table of all constants that are not settings of
-//! [`WeightedConfig`](super::config::WeightedConfig).
+//! Parameters of the default mode that are not settings of
+//! [`WeightedConfig`](super::config::WeightedConfig). Bounds of memory and of numerical errors are
+//! beside their uses.
 //!
 //! The table shows what happens when a constant is halved or doubled: the change of the mean accuracy
 //! on 13 public label sets, online or with passes, and the largest change on a set; and the
@@ -52,8 +53,9 @@ pub(super) const ITERATIONS: u32 = 30;
 /// Share of dependent vehicles among the present ones from which they may have decided verdicts.
 pub(super) const MANY_DEPENDENT: f64 = 0.2;
 
-/// Votes over which slow evidence fades: the cell's shares of labels, and agreement by confidence.
-pub(super) const LONG_MEMORY_VOTES: f64 = 10_000.0;
+/// Memory of slow evidence: number of compared labels after which the cell's shares of labels are
+/// halved, and of settled votes over which agreement by confidence fades to 1/e.
+pub(super) const LONG_MEMORY: f64 = 10_000.0;
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record.
 pub(super) const FLEET_PRIOR_VOTES: f64 = 1.0;
@@ -87,5 +89,8 @@ pub(super) const BAND_PRIOR_VOTES: f64 = 100.0;
 /// spread of ten equal bands, 1/2 + … + 1/10 (Barlow et al. 1972).
 pub(super) const BAND_NOISE: f64 = 6.0;
 
-/// Least and greatest weight of a vote for its confidence.
-pub(super) const CONFIDENCE_WEIGHTS: (f64, f64) = (0.1, 3.0);
+/// Least weight of a vote for its confidence.
+pub(super) const MIN_CONFIDENCE_WEIGHT: f64 = 0.1;
+
+/// Greatest weight of a vote for its confidence.
+pub(super) const MAX_CONFIDENCE_WEIGHT: f64 = 3.0;

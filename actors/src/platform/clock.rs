@@ -42,8 +42,8 @@ pub fn since_boot() -> Duration {
     read(ClockId::Boottime)
 }
 
-/// The kernel's monotonic clock, which stamps pictures of cameras. It stands still in suspension,
-/// so only differences count.
+/// The kernel's monotonic clock, which stamps pictures of cameras. It stands still in suspension: a
+/// picture from before looks as if it were from after.
 pub fn monotonic() -> Duration {
     read(ClockId::Monotonic)
 }

@@ -11,12 +11,15 @@ use ecod::admission::minimum_delay::MinimumDelay;
 use ecod::model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 
-/// Delay from the stated capture to arrival up to which a stamp is plausible: a clock that is
-/// further behind is wrong. Frames of this age are stale in a cell with the default
-/// `fusion.window.max_age_s`.
-pub(super) const MAX_DELAY: Duration = Duration::from_secs(1);
+/// Least delay from the stated capture to arrival up to which stamps are plausible: a clock that is
+/// further behind is wrong.
+const MAX_DELAY: Duration = Duration::from_secs(1);
 
 const MAX_DELAY_US: i64 = MAX_DELAY.as_micros() as i64;
+
+/// Time for which frames may arrive later than [`MAX_DELAY`] as a burst after a stall. If they are
+/// late for longer, the clock of the source has stood still.
+const MAX_BURST: Duration = Duration::from_secs(2);
 
 /// Time that a source states for a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -66,10 +69,17 @@ pub(super) struct FrameTime {
 /// stamp plus least delay is an arrival without jitter.
 #[derive(Debug)]
 pub(super) struct CaptureClock {
-    /// Configured time from capture to arrival, which replaces the stamps.
+    /// Configured time from capture to arrival, which replaces the stamped one.
     latency: Option<Duration>,
     delay: MinimumDelay,
-    last_stamp: Timestamp,
+    /// The latest stamp.
+    last_stamp: Option<Timestamp>,
+    /// Arrival of the first frame of those that are later than [`MAX_DELAY`].
+    late_since: Option<Timestamp>,
+    /// True once two frames had one stamp: the clock is too coarse to date frames.
+    is_coarse: bool,
+    /// The latest capture time.
+    last_captured: Timestamp,
 }
 
 impl CaptureClock {
@@ -77,45 +87,69 @@ impl CaptureClock {
         Self {
             latency: latency_s.map(Duration::from_secs_f64),
             delay: MinimumDelay::new(Timestamp::default()),
-            last_stamp: Timestamp::default(),
+            last_stamp: None,
+            late_since: None,
+            is_coarse: false,
+            last_captured: Timestamp::default(),
         }
     }
 
-    /// The capture time of the next frame, at the latest its arrival.
+    /// The capture time of the next frame, between the capture of the frame before and
+    /// the arrival.
     pub(super) fn time(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> FrameTime {
+        let time = self.estimate(stamp, arrived_at);
+        self.last_captured = time.captured_at.max(self.last_captured).min(arrived_at);
+        FrameTime {
+            captured_at: self.last_captured,
+            ..time
+        }
+    }
+
+    fn estimate(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> FrameTime {
         let latency = self.latency.unwrap_or_default();
-        let stated = match stamp {
-            Some(FrameStamp::Time(at)) => at,
-            Some(FrameStamp::Position(position)) => Timestamp::default() + position,
-            None => {
-                return FrameTime {
-                    captured_at: arrived_at - latency,
-                    source: TimeSource::Arrival,
-                };
-            }
+        let stated = stamp.map(|stamp| match stamp {
+            FrameStamp::Time(at) => at,
+            FrameStamp::Position(position) => Timestamp::default() + position,
+        });
+        self.is_coarse |= stated.is_some() && stated == self.last_stamp;
+        let Some(stated) = stated.filter(|_| !self.is_coarse) else {
+            return FrameTime {
+                captured_at: arrived_at - latency,
+                source: TimeSource::Arrival,
+            };
         };
         let delay_us = arrived_at.micros_from(stated);
-        let is_far_behind = delay_us.saturating_sub(self.delay.least()) > MAX_DELAY_US;
-        let is_position = matches!(stamp, Some(FrameStamp::Position(_)));
-        // Earlier delays do not apply to a clock that stands still, steps back, or is too slow, as
-        // positions that are counted at an assumed rate.
-        if stated <= self.last_stamp || (is_position && is_far_behind) {
+        let is_time = matches!(stamp, Some(FrameStamp::Time(_))) && self.latency.is_none();
+        let is_late = delay_us.saturating_sub(self.delay.least()) > MAX_DELAY_US;
+        self.late_since = is_late.then(|| self.late_since.unwrap_or(arrived_at));
+        let has_stood_still = self
+            .late_since
+            .is_some_and(|since| arrived_at.since(since) >= MAX_BURST);
+        // Earlier delays do not apply to a clock that has stepped back, or stood still.
+        if self.last_stamp.is_some_and(|last| stated < last)
+            || has_stood_still && !(is_time && self.is_plausible())
+        {
             self.delay = MinimumDelay::new(arrived_at);
+            self.late_since = None;
         }
-        self.last_stamp = stated;
+        self.last_stamp = Some(stated);
         self.delay.observe(delay_us, arrived_at);
-        let least = self.delay.least();
-        let is_plausible = (0..=MAX_DELAY_US).contains(&least);
-        match stamp {
-            Some(FrameStamp::Time(at)) if is_plausible && self.latency.is_none() => FrameTime {
-                captured_at: at,
+        if is_time && self.is_plausible() {
+            FrameTime {
+                captured_at: stated,
                 source: TimeSource::Stamp,
-            },
-            _ => FrameTime {
-                captured_at: stated.shifted(least) - latency,
+            }
+        } else {
+            FrameTime {
+                captured_at: stated.shifted(self.delay.least()) - latency,
                 source: TimeSource::Position,
-            },
+            }
         }
+    }
+
+    /// True if the stamps may be times of capture by a clock that is right.
+    fn is_plausible(&self) -> bool {
+        (0..=MAX_DELAY_US).contains(&self.delay.least())
     }
 }
 

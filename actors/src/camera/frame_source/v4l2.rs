@@ -17,7 +17,7 @@ use rustix::event::PollFlags;
 use rustix::io::Errno;
 
 use self::pixels::{FrameLayout, PixelConversion};
-use super::capture_clock::{CaptureClock, FrameStamp, MAX_DELAY, TimeSource};
+use super::capture_clock::{CaptureClock, FrameStamp, TimeSource};
 use super::{FrameError, FrameSource};
 use crate::camera::frame::CameraFrame;
 use crate::platform::clock;
@@ -189,7 +189,7 @@ impl FrameSource for V4l2Camera {
 /// is the start of exposure or the end of the frame, by the flag `TSTAMP_SRC_SOE`
 /// ([V4L2](https://docs.kernel.org/userspace-api/media/v4l/buffer.html#buffer-flags)).
 ///
-/// `None` if the stamp is of another clock, of the future, or older than [`MAX_DELAY`].
+/// `None` if the stamp is of another clock or of the future.
 fn age(metadata: &Metadata, now: Duration) -> Option<Duration> {
     let clock = metadata.flags & buffer::Flags::TIMESTAMP_MASK;
     if clock != buffer::Flags::TIMESTAMP_MONOTONIC {
@@ -198,7 +198,7 @@ fn age(metadata: &Metadata, now: Duration) -> Option<Duration> {
     let seconds = u64::try_from(metadata.timestamp.sec).ok()?;
     let micros = u64::try_from(metadata.timestamp.usec).ok()?;
     let stamp = Duration::from_secs(seconds).checked_add(Duration::from_micros(micros))?;
-    now.checked_sub(stamp).filter(|age| *age <= MAX_DELAY)
+    now.checked_sub(stamp)
 }
 
 /// Names of pixel formats in a text.

@@ -117,13 +117,87 @@ fn drifting_camera_clock_is_followed() {
     }
 }
 
+/// Frames of a stall of 1.6 s arrive together after it.
 #[test]
-fn slow_positions_err_by_a_second() {
+fn burst_keeps_its_spacing() {
+    for is_time in [true, false] {
+        let mut clock = CaptureClock::new(None);
+        for frame in frames(200) {
+            let stall = Duration::from_secs(5)..Duration::from_millis(6600);
+            let arrived_at = if stall.contains(&frame.position) {
+                START + stall.end + ms(150)
+            } else {
+                frame.arrived_at
+            };
+            let (stamp, way) = if is_time {
+                (FrameStamp::Time(frame.captured_at), ms(0))
+            } else {
+                (FrameStamp::Position(frame.position), ms(30))
+            };
+            let time = clock.time(Some(stamp), arrived_at);
+            assert_eq!(time.captured_at, frame.captured_at + way);
+        }
+    }
+}
+
+/// A stream that pauses for 5 s, while its positions stand still.
+#[test]
+fn paused_positions_recover() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(100) {
+        clock.time(Some(FrameStamp::Position(frame.position)), frame.arrived_at);
+    }
+    for frame in frames(300).skip(100) {
+        let arrived_at = frame.arrived_at + ms(5000);
+        let time = clock.time(Some(FrameStamp::Position(frame.position)), arrived_at);
+        if frame.position > Duration::from_millis(7500) {
+            let error_us = time.captured_at.micros_from(frame.captured_at + ms(5030));
+            assert!(
+                error_us.abs() <= 120_000,
+                "{error_us} us at {:?}",
+                frame.position
+            );
+        }
+    }
+}
+
+#[test]
+fn coarse_stamps_give_arrival() {
+    let mut clock = CaptureClock::new(None);
+    for frame in frames(100).skip(1) {
+        let second = Timestamp(frame.captured_at.micros() / 1_000_000 * 1_000_000);
+        let time = clock.time(Some(FrameStamp::Time(second)), frame.arrived_at);
+        if frame.position > PERIOD * 2 {
+            assert_eq!(time.captured_at, frame.arrived_at);
+            assert_eq!(time.source, TimeSource::Arrival);
+        }
+    }
+}
+
+/// A clock with 40 % of the right rate.
+#[test]
+fn slow_positions_err_by_seconds() {
     let mut clock = CaptureClock::new(None);
     for frame in frames(1000) {
         let stamp = FrameStamp::Position(frame.position.mul_f64(0.4));
         let time = clock.time(Some(stamp), frame.arrived_at);
         let early = frame.arrived_at.since(time.captured_at);
-        assert!(early <= MAX_DELAY, "{early:?}");
+        assert!(early <= MAX_DELAY + MAX_BURST, "{early:?}");
+    }
+}
+
+/// A clock that falls behind by 200 millionths passes the limit of plausible delays.
+#[test]
+fn times_of_frames_never_go_back() {
+    let mut clock = CaptureClock::new(None);
+    let mut last = Timestamp::default();
+    let mut arrived_at = Timestamp::default();
+    for frame in frames(20 * 600) {
+        arrived_at = frame.arrived_at.max(arrived_at);
+        let behind = ms(940) + frame.position.mul_f64(2e-4);
+        let stamp = FrameStamp::Time(frame.captured_at - behind);
+        let time = clock.time(Some(stamp), arrived_at);
+        assert!(time.captured_at >= last && time.captured_at <= arrived_at);
+        last = time.captured_at;
     }
 }

@@ -11,6 +11,7 @@ use anyhow::{Context, bail, ensure};
 use axum::body::{Body, BodyDataStream};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
+use bytes::BytesMut;
 use ecod::model::time::Timestamp;
 use futures_util::StreamExt;
 use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, WWW_AUTHENTICATE};
@@ -26,8 +27,8 @@ use crate::camera::frame_source::{FrameError, FrameSource, SourceConfig, TimeSou
 use crate::camera::image_codec;
 use crate::platform::clock;
 
-/// Maximum length of a line of a part's header in bytes.
-const MAX_LINE: usize = 4096;
+/// Maximum length of a part's header in bytes.
+const MAX_HEADER: usize = 16 << 10;
 
 /// Maximum length of a picture in bytes.
 const MAX_PICTURE: usize = 32 << 20;
@@ -36,7 +37,7 @@ const MAX_PICTURE: usize = 32 << 20;
 pub(super) struct MotionJpeg {
     origin: String,
     runtime: Runtime,
-    parts: Parts,
+    parts: PartReader,
     /// The first part, which [`MotionJpeg::open`] has read.
     first: Option<Part>,
     timeout: Duration,
@@ -73,23 +74,29 @@ impl MotionJpeg {
             })
             .await
         });
-        match opened {
-            Ok(Ok((parts, first))) => Ok(Some(Self {
-                origin: source.origin(),
-                runtime,
-                parts,
-                first: Some(first),
-                timeout,
-                clock: CaptureClock::new(*latency_s),
-                time_source: TimeSource::Arrival,
-                seq: 0,
-            })),
+        let (parts, first) = match opened {
+            Ok(Ok(opened)) => opened,
             Ok(Err(error)) => {
                 eprintln!("left to FFmpeg: {error:#}");
-                Ok(None)
+                runtime.shutdown_background();
+                return Ok(None);
             }
-            Err(_) => Err(failed(format!("no picture within {timeout:?}"))),
-        }
+            Err(_) => {
+                // Does not wait for a name that is still being resolved.
+                runtime.shutdown_background();
+                return Err(failed(format!("no picture within {timeout:?}")));
+            }
+        };
+        Ok(Some(Self {
+            origin: source.origin(),
+            runtime,
+            parts,
+            first: Some(first),
+            timeout,
+            clock: CaptureClock::new(*latency_s),
+            time_source: TimeSource::Arrival,
+            seq: 0,
+        }))
     }
 
     fn next_part(&mut self) -> Result<Part, FrameError> {
@@ -157,11 +164,12 @@ impl Address {
     }
 
     /// Requests the stream, with the login only if the camera requires it.
-    async fn open(&self) -> anyhow::Result<Parts> {
+    async fn open(&self) -> anyhow::Result<PartReader> {
         let mut response = self.request(None).await?;
         if response.status() == StatusCode::UNAUTHORIZED {
             let challenge = response.headers().get(WWW_AUTHENTICATE);
-            let is_basic = challenge.is_some_and(|it| it.as_bytes().starts_with(b"Basic"));
+            let scheme = challenge.and_then(|challenge| challenge.as_bytes().get(..5));
+            let is_basic = scheme.is_some_and(|scheme| scheme.eq_ignore_ascii_case(b"basic"));
             let login = self.login.as_deref().filter(|_| is_basic);
             response = self.request(Some(login.context("no Basic login")?)).await?;
         }
@@ -169,12 +177,16 @@ impl Address {
         let content = response.headers().get(CONTENT_TYPE);
         let content = content.and_then(|content| content.to_str().ok());
         ensure!(
-            content.is_some_and(|content| content.starts_with("multipart/x-mixed-replace")),
+            content.is_some_and(|content| {
+                content
+                    .to_ascii_lowercase()
+                    .starts_with("multipart/x-mixed-replace")
+            }),
             "content {content:?}"
         );
-        Ok(Parts {
+        Ok(PartReader {
             body: response.into_body().into_data_stream(),
-            buffer: Vec::new(),
+            buffer: BytesMut::new(),
         })
     }
 
@@ -185,7 +197,9 @@ impl Address {
         let (mut sender, connection) =
             hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
         // An error of the connection ends the body of the response.
-        tokio::spawn(async { connection.await.unwrap_or_default() });
+        tokio::spawn(async {
+            let _ = connection.await;
+        });
         let path = self.uri.path_and_query().map_or("/", |path| path.as_str());
         let mut request = Request::get(path).header(HOST, format!("{host}:{port}"));
         if let Some(login) = login {
@@ -199,26 +213,27 @@ impl Address {
 
 /// One picture of the stream.
 struct Part {
-    jpeg: Vec<u8>,
+    jpeg: BytesMut,
     stamp: Option<FrameStamp>,
     /// Time when the end of the header arrived.
     arrived_at: Timestamp,
 }
 
 /// The parts of a response.
-struct Parts {
+struct PartReader {
     body: BodyDataStream,
     /// Bytes of the response that have been received and not yet used.
-    buffer: Vec<u8>,
+    buffer: BytesMut,
 }
 
-impl Parts {
+impl PartReader {
     async fn next(&mut self) -> anyhow::Result<Part> {
-        while !self.line().await?.starts_with("--") {}
+        let mut room = MAX_HEADER;
+        while !self.line(&mut room).await?.starts_with("--") {}
         let mut length = None;
         let mut stamp = None;
         loop {
-            let line = self.line().await?;
+            let line = self.line(&mut room).await?;
             if line.is_empty() {
                 break;
             }
@@ -235,25 +250,24 @@ impl Parts {
         while self.buffer.len() < length {
             self.receive().await?;
         }
-        let rest = self.buffer.split_off(length);
         Ok(Part {
-            jpeg: std::mem::replace(&mut self.buffer, rest),
+            jpeg: self.buffer.split_to(length),
             stamp,
             arrived_at,
         })
     }
 
-    /// The next line without its end.
-    async fn line(&mut self) -> anyhow::Result<String> {
+    /// The next line without its end; `room` is the number of bytes that the header may still have.
+    async fn line(&mut self, room: &mut usize) -> anyhow::Result<String> {
         loop {
-            if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
-                let line: Vec<u8> = self.buffer.drain(..=end).collect();
+            let end = self.buffer.iter().position(|byte| *byte == b'\n');
+            let bytes = end.map_or(self.buffer.len(), |end| end + 1);
+            ensure!(bytes <= *room, "the header of a part is too long");
+            if end.is_some() {
+                *room -= bytes;
+                let line = self.buffer.split_to(bytes);
                 return Ok(String::from_utf8_lossy(&line).trim_end().to_owned());
             }
-            ensure!(
-                self.buffer.len() < MAX_LINE,
-                "a line of a header is too long"
-            );
             self.receive().await?;
         }
     }

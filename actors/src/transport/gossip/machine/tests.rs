@@ -18,6 +18,8 @@ const KEY: &str = "0101010101010101010101010101010101010101010101010101010101010
 /// Machines, the datagrams between them, and the events of each machine.
 struct Cell {
     now: Timestamp,
+    /// Name of the cell in which nodes start.
+    name: NodeName,
     nodes: BTreeMap<usize, Node>,
     under_way: Vec<(Timestamp, SocketAddr, SocketAddr, Vec<u8>)>,
     recorded: Vec<(SocketAddr, SocketAddr, Vec<u8>)>,
@@ -46,6 +48,7 @@ impl Cell {
     fn seeded(multicast: bool, seed: u64) -> Self {
         Self {
             now: Timestamp(1_700_000_000_000_000),
+            name: NodeName::from_static("lot-1"),
             nodes: BTreeMap::new(),
             under_way: Vec::new(),
             recorded: Vec::new(),
@@ -90,7 +93,7 @@ impl Cell {
         };
         let mut session = SessionNonce::default();
         self.rng.fill(&mut session);
-        let cell = NodeName::from_static("lot-1");
+        let cell = self.name.clone();
         let key = CellKey::new(key, &cell);
         let seed = self.rng.random();
         let setup = GossipSetup {
@@ -677,6 +680,31 @@ fn other_key_stays_unseen() {
     assert!(cell.sees(3).is_empty());
     assert!(cell.nodes[&1].machine.counters.get(FrameEvent::BadSeal) > 0);
     assert!(cell.nodes[&3].machine.counters.get(FrameEvent::BadSeal) > 0);
+}
+
+/// Only a node that has found no other node for ten seconds may be meant for the other cell.
+#[test]
+fn other_cell_is_named_when_alone() {
+    let is_warned = |cell: &Cell| {
+        let troubles = &cell.nodes[&1].troubles;
+        troubles
+            .iter()
+            .any(|(_, kind)| *kind == TroubleKind::OtherCell)
+    };
+    let mut lone = Cell::new(true);
+    lone.start(1, "node-1");
+    lone.name = NodeName::from_static("lot-2");
+    lone.start(2, "node-2");
+    lone.run(5000);
+    assert!(!is_warned(&lone), "others may still be starting");
+    lone.run(10_000);
+    assert!(is_warned(&lone));
+
+    let mut whole = Cell::of(2);
+    whole.name = NodeName::from_static("lot-2");
+    whole.start(3, "node-3");
+    whole.run(20_000);
+    assert!(!is_warned(&whole), "a neighbouring cell");
 }
 
 /// Only the other side can detect a wrong key; this side at least sees a silent seed.
