@@ -20,8 +20,8 @@ pub(super) struct Alarm {
     example: String,
 }
 
-/// Judges troubles by node. A trouble is right if the fault of its minute explains it, or the fault of the minute before.
-/// A trouble before the first fault is wrong.
+/// Judges troubles by node. A trouble is right if a fault explains it: of its minute, of the minute before, or an earlier
+/// fault whose message brokers retain. A trouble before the first fault is wrong.
 pub(super) fn judge(
     troubles: &BTreeMap<NodeName, Vec<LoggedTrouble>>,
     minutes: &[Minute],
@@ -32,10 +32,14 @@ pub(super) fn judge(
         .flat_map(|(node, troubles)| troubles.iter().map(move |trouble| (node, trouble)));
     for (node, trouble) in all {
         let begun = minutes.partition_point(|minute| minute.span.0 <= trouble.at);
-        let possible = &minutes[begun.saturating_sub(2)..begun];
+        let (earlier, possible) = minutes[..begun].split_at(begun.saturating_sub(2));
+        let retained = earlier
+            .iter()
+            .filter(|minute| minute.disturbance.is_retained());
         let cause = possible
             .iter()
             .rev()
+            .chain(retained)
             .find(|minute| minute.disturbance.explains(trouble, &minute.struck));
         let fault = cause
             .or(possible.last())

@@ -167,6 +167,11 @@ impl Disturbance {
         }
     }
 
+    /// True if brokers retain a message of it, which nodes receive again over every new link.
+    pub(super) fn is_retained(self) -> bool {
+        matches!(self.kind, Kind::BadInput)
+    }
+
     /// The fault without its length.
     pub(super) fn cause(self) -> &'static str {
         match self.kind {
