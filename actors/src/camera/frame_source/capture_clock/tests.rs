@@ -7,7 +7,7 @@ fn ms(milliseconds: u64) -> Duration {
     Duration::from_millis(milliseconds)
 }
 
-/// A frame every 50 ms, which takes 30 ms to arrive, and up to 120 ms more.
+/// A frame every 50 ms, which takes 30 ms to arrive, and up to 40 ms more.
 struct Frame {
     position: Duration,
     captured_at: Timestamp,
@@ -21,7 +21,7 @@ fn frames(count: u32) -> impl Iterator<Item = Frame> {
         Frame {
             position,
             captured_at,
-            arrived_at: captured_at + ms(30) + ms(u64::from(number * 7 % 5) * 30),
+            arrived_at: captured_at + ms(30) + ms(u64::from(number * 7 % 5) * 10),
         }
     })
 }
