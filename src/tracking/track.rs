@@ -40,9 +40,12 @@ pub(super) const CONFIRMED_HITS: u32 = 5;
 /// may report the same object almost at once.
 const CONFIRMING_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Maximum evidence from observations for an object that only one vehicle detects, nats, and maximum of all evidence if
-/// others have its place in view: two of the others outweigh it with at most -2.5 nats each.
-const SOLE_NATS: f64 = 4.0;
+/// Maximum evidence from observations for an object that only one vehicle detects, nats.
+const SOLE_NATS: f64 = 2.0;
+
+/// Maximum evidence for an object that only one vehicle detects while others have its place in view, nats. Two of the
+/// others outweigh this evidence with at most -2.5 nats each.
+const MAX_DENIED_NATS: f64 = 4.0;
 
 /// Minimum number of vehicles whose observations count against an object that only one vehicle detects. With one
 /// statement against another, it is open which vehicle is wrong.
@@ -281,7 +284,7 @@ impl Track {
             .unwrap_or(1.0);
         let sole = observations.min(SOLE_NATS * witness) + confidences;
         if denied < 0.0 {
-            logistic(sole.min(SOLE_NATS) + denied)
+            logistic(sole.min(MAX_DENIED_NATS) + denied)
         } else {
             logistic(sole)
         }
