@@ -233,7 +233,8 @@ async fn who_is_alone_says_why() {
     until("the edge names the other cell", || async {
         let troubles = edge.troubles();
         troubles.iter().any(|(_, trouble)| {
-            trouble.cause == "received a datagram of cell lott from 127.0.0.1; this node is in lot"
+            trouble.cause
+                == "received a datagram of another cell from 127.0.0.1; this node is in lot and finds no other node"
         })
     })
     .await;

@@ -124,15 +124,26 @@ const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 /// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading
 /// is not known to 0.15 rad, and mean error of length in metres, where it is known.
 fn errors(said: ReportedFields) -> [f64; 3] {
-    let recording = recording_of(&TrafficConfig {
-        observers: 6,
-        duration_s: 8.0,
-        said,
-        ..TrafficConfig::default()
-    });
-    let frames = &recording.truth.frames;
     let mut sums = [(0.0, 0.0); 3];
-    fuse(&recording, |_, map| {
+    for seed in SEED..SEED + 6 {
+        let recording = recording_by(
+            seed,
+            &TrafficConfig {
+                observers: 6,
+                duration_s: 8.0,
+                said: said.clone(),
+                ..TrafficConfig::default()
+            },
+        );
+        add_errors(&recording, &mut sums);
+    }
+    sums.map(|(sum, count)| sum / count)
+}
+
+/// Adds the errors in the maps of a recording and their numbers.
+fn add_errors(recording: &TrafficRecording, sums: &mut [(f64, f64); 3]) {
+    let frames = &recording.truth.frames;
+    fuse(recording, |_, map| {
         let Some(map) = map else { return };
         let Some(place) = frames
             .iter()
@@ -171,7 +182,6 @@ fn errors(said: ReportedFields) -> [f64; 3] {
             }
         }
     });
-    sums.map(|(sum, count)| sum / count)
 }
 
 /// Where cars are that go faster than 2 m/s, and how fast.
@@ -203,7 +213,7 @@ fn stated_velocities_headings_sizes_improve_maps() {
     };
     let rich = errors(rich);
     assert!(
-        rich[0] < 0.95 * plain[0],
+        rich[0] < 0.9 * plain[0],
         "velocities are off by {} and {} m/s",
         rich[0],
         plain[0]
