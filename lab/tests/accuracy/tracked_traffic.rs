@@ -123,7 +123,7 @@ const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 
 /// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading
 /// is not known to 0.15 rad, and mean error of length in metres, where it is known.
-fn errors(said: ReportedFields) -> [f64; 3] {
+fn errors(said: &ReportedFields) -> [f64; 3] {
     let mut sums = [(0.0, 0.0); 3];
     for seed in SEED..SEED + 6 {
         let recording = recording_by(
@@ -204,14 +204,14 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
 
 #[test]
 fn stated_velocities_headings_sizes_improve_maps() {
-    let plain = errors(ReportedFields::default());
+    let plain = errors(&ReportedFields::default());
     let rich = ReportedFields {
         velocities_mps: Some(0.6),
         headings_rad: Some(0.1),
         sizes_m: Some(0.3),
         ..ReportedFields::default()
     };
-    let rich = errors(rich);
+    let rich = errors(&rich);
     assert!(
         rich[0] < 0.9 * plain[0],
         "velocities are off by {} and {} m/s",
