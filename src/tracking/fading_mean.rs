@@ -11,7 +11,7 @@ impl FadingMean {
     /// Number of values beyond which earlier values are discounted.
     pub(super) const MEMORY: f64 = 500.0;
 
-    /// A mean that counts as so many values.
+    /// An initial mean with the weight of this number of values.
     pub(super) fn new(mean: f64, weight: f64) -> Self {
         Self {
             sum: mean * weight,

@@ -24,7 +24,7 @@
 pub(super) const TOLERATED_PHI: f64 = 0.22;
 
 /// Standard deviations by which agreement must exceed the expected agreement before two vehicles
-/// count as dependent. Many pairs are tested at once: one in 3 million exceeds it by chance.
+/// count as dependent. The limit is high because many pairs are tested at once.
 pub(super) const SIGNIFICANCE: f64 = 5.0;
 
 /// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost of
@@ -47,7 +47,7 @@ pub(super) const TENURE_VOTES: f64 = 50.0;
 /// third would be 0.
 pub(super) const SELF_SUPPORT: f64 = 0.01;
 
-/// Iterations that find the main group, and those that find the vehicles' factors.
+/// Number of iterations for the main group, and for the vehicles' factors.
 pub(super) const ITERATIONS: u32 = 30;
 
 /// Share of dependent vehicles among the present ones from which they may have decided verdicts.

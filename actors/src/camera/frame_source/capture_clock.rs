@@ -74,7 +74,7 @@ pub(super) struct CaptureClock {
     delay: MinimumDelay,
     /// The latest stamp.
     last_stamp: Option<Timestamp>,
-    /// Arrival of the first frame of those that are later than [`MAX_DELAY`].
+    /// Start of the present run of frames that are later than [`MAX_DELAY`], by arrival.
     late_since: Option<Timestamp>,
     /// True once two frames had one stamp: the clock is too coarse to date frames.
     is_coarse: bool,

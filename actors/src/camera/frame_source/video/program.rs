@@ -259,7 +259,7 @@ struct Pictures {
     has_positions: bool,
 }
 
-/// A picture with what the source states about its time.
+/// A picture with the time that its source states.
 struct Picture {
     image: Mat,
     stamp: Option<FrameStamp>,
