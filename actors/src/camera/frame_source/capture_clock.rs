@@ -54,14 +54,6 @@ impl fmt::Display for TimeSource {
     }
 }
 
-/// Capture time of a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct FrameTime {
-    /// Time of capture by the node's clock.
-    pub(super) captured_at: Timestamp,
-    pub(super) source: TimeSource,
-}
-
 /// Determines the capture times of one opened live source.
 ///
 /// The least delay from stamp to arrival over the last 10 to 20 seconds is the difference of the
@@ -80,6 +72,8 @@ pub(super) struct CaptureClock {
     is_coarse: bool,
     /// The latest capture time.
     last_captured: Timestamp,
+    /// How it was determined.
+    source: TimeSource,
 }
 
 impl CaptureClock {
@@ -91,21 +85,24 @@ impl CaptureClock {
             late_since: None,
             is_coarse: false,
             last_captured: Timestamp::default(),
+            source: TimeSource::Arrival,
         }
+    }
+
+    /// How the capture time of the latest frame was determined.
+    pub(super) fn source(&self) -> TimeSource {
+        self.source
     }
 
     /// The capture time of the next frame, between the capture of the frame before and
     /// the arrival.
-    pub(super) fn time(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> FrameTime {
-        let time = self.estimate(stamp, arrived_at);
-        self.last_captured = time.captured_at.max(self.last_captured).min(arrived_at);
-        FrameTime {
-            captured_at: self.last_captured,
-            ..time
-        }
+    pub(super) fn time(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> Timestamp {
+        let captured_at = self.estimate(stamp, arrived_at);
+        self.last_captured = captured_at.max(self.last_captured).min(arrived_at);
+        self.last_captured
     }
 
-    fn estimate(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> FrameTime {
+    fn estimate(&mut self, stamp: Option<FrameStamp>, arrived_at: Timestamp) -> Timestamp {
         let latency = self.latency.unwrap_or_default();
         let stated = stamp.map(|stamp| match stamp {
             FrameStamp::Time(at) => at,
@@ -113,10 +110,8 @@ impl CaptureClock {
         });
         self.is_coarse |= stated.is_some() && stated == self.last_stamp;
         let Some(stated) = stated.filter(|_| !self.is_coarse) else {
-            return FrameTime {
-                captured_at: arrived_at - latency,
-                source: TimeSource::Arrival,
-            };
+            self.source = TimeSource::Arrival;
+            return arrived_at - latency;
         };
         let delay_us = arrived_at.micros_from(stated);
         let is_time = matches!(stamp, Some(FrameStamp::Time(_))) && self.latency.is_none();
@@ -135,15 +130,11 @@ impl CaptureClock {
         self.last_stamp = Some(stated);
         self.delay.observe(delay_us, arrived_at);
         if is_time && self.is_plausible() {
-            FrameTime {
-                captured_at: stated,
-                source: TimeSource::Stamp,
-            }
+            self.source = TimeSource::Stamp;
+            stated
         } else {
-            FrameTime {
-                captured_at: stated.shifted(self.delay.least()) - latency,
-                source: TimeSource::Position,
-            }
+            self.source = TimeSource::Position;
+            stated.shifted(self.delay.least()) - latency
         }
     }
 

@@ -37,7 +37,6 @@ pub(super) struct V4l2Camera {
     layout: FrameLayout,
     timeout: Duration,
     clock: CaptureClock,
-    time_source: TimeSource,
     seq: u64,
 }
 
@@ -112,7 +111,6 @@ impl V4l2Camera {
             layout,
             timeout,
             clock: CaptureClock::new(latency_s),
-            time_source: TimeSource::Arrival,
             seq: 0,
         })
     }
@@ -169,11 +167,9 @@ impl FrameSource for V4l2Camera {
             origin: self.origin.clone(),
             reason,
         })?;
-        let time = self.clock.time(stamp, arrived_at);
-        self.time_source = time.source;
         let frame = CameraFrame {
             image,
-            captured_at: time.captured_at,
+            captured_at: self.clock.time(stamp, arrived_at),
             seq: self.seq,
         };
         self.seq += 1;
@@ -181,7 +177,7 @@ impl FrameSource for V4l2Camera {
     }
 
     fn time_source(&self) -> TimeSource {
-        self.time_source
+        self.clock.source()
     }
 }
 

@@ -42,7 +42,6 @@ pub(super) struct MotionJpeg {
     first: Option<Part>,
     timeout: Duration,
     clock: CaptureClock,
-    time_source: TimeSource,
     seq: u64,
 }
 
@@ -94,7 +93,6 @@ impl MotionJpeg {
             first: Some(first),
             timeout,
             clock: CaptureClock::new(*latency_s),
-            time_source: TimeSource::Arrival,
             seq: 0,
         }))
     }
@@ -125,11 +123,9 @@ impl FrameSource for MotionJpeg {
                 origin: self.origin.clone(),
                 reason: damage.to_string(),
             })?;
-        let time = self.clock.time(part.stamp, part.arrived_at);
-        self.time_source = time.source;
         let frame = CameraFrame {
             image,
-            captured_at: time.captured_at,
+            captured_at: self.clock.time(part.stamp, part.arrived_at),
             seq: self.seq,
         };
         self.seq += 1;
@@ -137,7 +133,7 @@ impl FrameSource for MotionJpeg {
     }
 
     fn time_source(&self) -> TimeSource {
-        self.time_source
+        self.clock.source()
     }
 }
 

@@ -134,7 +134,6 @@ struct Video {
     playback: Option<Playback>,
     /// Capture times of a live source.
     clock: CaptureClock,
-    time_source: TimeSource,
     seq: u64,
 }
 
@@ -437,7 +436,6 @@ impl Video {
             pictures,
             playback: None,
             clock: CaptureClock::new(None),
-            time_source: TimeSource::Playback,
             seq: 0,
         })
     }
@@ -512,9 +510,7 @@ impl FrameSource for Video {
             }
             clock::now()
         } else {
-            let time = self.clock.time(picture.stamp, picture.arrived_at);
-            self.time_source = time.source;
-            time.captured_at
+            self.clock.time(picture.stamp, picture.arrived_at)
         };
         let frame = CameraFrame {
             image: picture.image,
@@ -526,7 +522,10 @@ impl FrameSource for Video {
     }
 
     fn time_source(&self) -> TimeSource {
-        self.time_source
+        match self.playback {
+            Some(_) => TimeSource::Playback,
+            None => self.clock.source(),
+        }
     }
 }
 
