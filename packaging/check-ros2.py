@@ -35,7 +35,7 @@ def read(path, counts):
                 for found in decoded.detections:
                     # All reports state cars, so the score is the probability of the object.
                     (hypothesis,) = (result.hypothesis for result in found.results)
-                    assert hypothesis.class_id == "car" and 0 < hypothesis.score < 0.999
+                    assert hypothesis.class_id == "car" and 0 < hypothesis.score < 1, hypothesis
             if channel.topic == "/tf":
                 transform, optical = decoded.transforms
                 assert transform.child_frame_id == "euclid_2_camera" and transform.transform.translation.y == 6.0

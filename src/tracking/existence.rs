@@ -224,7 +224,7 @@ pub(super) struct SensorHistory {
     sequence: f64,
     /// Evidence of all misses without occlusion before the first detection, nats.
     absence: f64,
-    /// Fading sums of the evidence of confidences, nats, and of their number.
+    /// Fading sums of the evidence of confidences, nats, and of the number of detections.
     score: f64,
     weight: f64,
 }
@@ -339,6 +339,13 @@ impl SensorHistory {
         } else {
             0.0
         }
+    }
+
+    /// Maximum evidence of the detections of this vehicle alone, nats. The cause of a false detection persists with an
+    /// unknown probability; if all probabilities are equally likely, n false detections in a row have the probability
+    /// 1/(n+1) (Laplace's rule of succession).
+    pub(super) fn max_sole_nats(&self) -> f64 {
+        self.weight.ln_1p()
     }
 
     fn confidence_nats(&self, at: Timestamp) -> f64 {

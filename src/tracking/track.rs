@@ -40,9 +40,6 @@ pub(super) const CONFIRMED_HITS: u32 = 5;
 /// may report the same object almost at once.
 const CONFIRMING_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Maximum evidence from observations for an object that only one vehicle detects, nats.
-const SOLE_NATS: f64 = 2.0;
-
 /// Maximum evidence for an object that only one vehicle detects while others have its place in view, nats. Two of the
 /// others outweigh this evidence with at most -2.5 nats each.
 const MAX_DENIED_NATS: f64 = 4.0;
@@ -272,17 +269,15 @@ impl Track {
         let Some(denied) = self.denied_nats(at, &trust) else {
             return logistic(observations + confidences);
         };
-        // The cause of a false detection persists, so repeated detections by one vehicle are not independent. The limit
-        // falls with the vehicle's weight.
-        let detecting = self
+        // Without a detection, the object comes from another aggregator's map.
+        let limit = self
             .history
             .iter()
-            .filter(|history| history.last_hit.is_some());
-        let witness = detecting
-            .map(|history| trust(history.sensor))
+            .filter(|history| history.last_hit.is_some())
+            .map(|history| trust(history.sensor) * history.max_sole_nats())
             .reduce(f64::max)
-            .unwrap_or(1.0);
-        let sole = observations.min(SOLE_NATS * witness) + confidences;
+            .unwrap_or(f64::INFINITY);
+        let sole = observations.min(limit) + confidences;
         if denied < 0.0 {
             logistic(sole.min(MAX_DENIED_NATS) + denied)
         } else {
