@@ -29,10 +29,11 @@ use ground::HalfDepth;
 pub use mount_check::MountCheck;
 pub use mount_fit::{MIN_BOXES, MountEstimate, MountFitError, fit_mount};
 
-use crate::model::detection::Detection;
+use crate::model::detection::{BoundingBox, Detection};
 use crate::model::geometry::{Covariance, Pose};
 use crate::model::names::Label;
 use crate::perception::camera::{Intrinsics, Mount};
+use crate::perception::polygon::Polygon;
 use crate::wire::PerceivedObject;
 
 /// The reason why a detection has no position.
@@ -47,8 +48,8 @@ pub enum ProjectionError {
     /// The box has no area, is not finite, or gives no distance.
     #[error("the box of {0:?} gives no distance")]
     DegenerateBox(Label),
-    /// The image's edge cuts the object: the box does not show its whole extent.
-    #[error("the image's edge cuts the box of {0:?}")]
+    /// The image's edge or a mask cuts the object: the box does not show its whole extent.
+    #[error("the image's edge or a mask cuts the box of {0:?}")]
     Clipped(Label),
     /// The foot of the box is above the horizon, or so near it that the ground gives no distance.
     #[error(
@@ -73,14 +74,15 @@ impl ProjectionError {
     }
 }
 
-/// The edges of the image that cut a box, so that it does not show the whole object.
+/// The sides at which the image's edge or a mask cuts a box, so that it does not show the whole
+/// object.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Cut {
-    /// True if the upper edge cuts the box.
+    /// True if the box is cut at its upper side.
     pub upper: bool,
-    /// True if the lower edge cuts the box.
+    /// True if the box is cut at its lower side.
     pub lower: bool,
-    /// True if the left or the right edge cuts the box.
+    /// True if the box is cut at its left or its right side.
     pub side: bool,
 }
 
@@ -91,6 +93,8 @@ pub struct Projection {
     intrinsics: Intrinsics,
     mount: Mount,
     to_level: Matrix3<f64>,
+    /// Masked parts of the raw image, in pixels.
+    masks: Vec<Polygon>,
 }
 
 impl Projection {
@@ -101,7 +105,14 @@ impl Projection {
             intrinsics,
             mount,
             to_level: mount.to_level(),
+            masks: Vec::new(),
         }
+    }
+
+    /// The projection of a camera with these parts of the raw image masked, in pixels.
+    #[must_use]
+    pub fn with_masks(self, masks: Vec<Polygon>) -> Self {
+        Self { masks, ..self }
     }
 
     /// The settings with which this projection was created.
@@ -114,8 +125,8 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// The edges of the image that cut a box in the raw image, before distortion is removed. The
-    /// corners of a target show the whole of it.
+    /// The sides at which a box in the raw image, before distortion is removed, is cut. The corners
+    /// of a target show the whole of it.
     pub fn cut(&self, detection: &Detection) -> Cut {
         if detection.corners.is_some() && self.config.ranging.uses_corners() {
             return Cut::default();
@@ -123,10 +134,42 @@ impl Projection {
         let bounds = &detection.bounding_box;
         let width = f64::from(self.intrinsics.width);
         let height = f64::from(self.intrinsics.height);
+        let near_px = EDGE_PX + self.config.pixel_sigma_px;
+        let at = |side: BoundingBox| {
+            let around = BoundingBox {
+                x_min: side.x_min - near_px,
+                y_min: side.y_min - near_px,
+                x_max: side.x_max + near_px,
+                y_max: side.y_max + near_px,
+            };
+            self.masks.iter().any(|mask| mask.overlaps(&around))
+        };
+        let BoundingBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        } = *bounds;
+        let upper = BoundingBox {
+            y_max: y_min,
+            ..*bounds
+        };
+        let lower = BoundingBox {
+            y_min: y_max,
+            ..*bounds
+        };
+        let left = BoundingBox {
+            x_max: x_min,
+            ..*bounds
+        };
+        let right = BoundingBox {
+            x_min: x_max,
+            ..*bounds
+        };
         Cut {
-            upper: bounds.y_min < EDGE_PX,
-            lower: bounds.y_max > height - EDGE_PX,
-            side: bounds.x_min < EDGE_PX || bounds.x_max > width - EDGE_PX,
+            upper: y_min < EDGE_PX || at(upper),
+            lower: y_max > height - EDGE_PX || at(lower),
+            side: x_min < EDGE_PX || x_max > width - EDGE_PX || at(left) || at(right),
         }
     }
 

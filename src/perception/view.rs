@@ -1,6 +1,6 @@
 //! The landmarks in view of a camera: near enough to be read, inside the image, not turned away,
-//! not hidden. If the camera's height is configured, image rows are checked by the ground;
-//! otherwise only columns are checked.
+//! not hidden, not masked. If the camera's height is configured, image rows are checked by the
+//! ground; otherwise only columns are checked.
 //!
 //! A report lists these landmarks as `seen`, so that a landmark in view without a detection counts
 //! as empty. A false claim does more harm than a missing one, so a landmark must meet every
@@ -9,10 +9,12 @@
 use nalgebra::{Matrix3, Point2, Point3, Vector2};
 
 use crate::config::{check_optional, config_section};
+use crate::model::detection::BoundingBox;
 use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::LandmarkId;
 use crate::perception::camera::{Intrinsics, Mount};
 use crate::perception::landmark::Landmark;
+use crate::perception::polygon::Polygon;
 use crate::perception::projection::ObjectSizes;
 use crate::wire::PerceivedObject;
 
@@ -80,14 +82,15 @@ impl<'a> Widths<'a> {
 
 /// A camera where it stands.
 #[derive(Debug, Clone, Copy)]
-pub struct PosedCamera {
+pub struct PosedCamera<'a> {
     pose: Pose,
     intrinsics: Intrinsics,
     from_level: Matrix3<f64>,
     height_m: Option<f64>,
+    masks: &'a [Polygon],
 }
 
-impl PosedCamera {
+impl<'a> PosedCamera<'a> {
     /// The camera of a vehicle, with the pose of the camera itself.
     pub fn new(pose: Pose, mount: &Mount, intrinsics: Intrinsics) -> Self {
         Self {
@@ -95,7 +98,14 @@ impl PosedCamera {
             intrinsics,
             from_level: mount.to_level().transpose(),
             height_m: mount.height_m,
+            masks: &[],
         }
+    }
+
+    /// The camera with these parts of its image masked, in pixels without distortion.
+    #[must_use]
+    pub fn with_masks(self, masks: &'a [Polygon]) -> Self {
+        Self { masks, ..self }
     }
 
     /// The pixel of a point on the ground or, if the camera's height is not configured, at the
@@ -179,6 +189,26 @@ fn is_readable(landmark: &Landmark, camera: &PosedCamera, widths: &Widths) -> bo
         && left.x >= config.margin_px
         && right.x <= width - config.margin_px
         && (camera.height_m.is_none() || [left, right].iter().all(is_on_rows))
+        && !is_masked(&left, &right, camera)
+}
+
+/// True if a mask hides a part of a target with these ends, which is taken to be as high as wide.
+/// Without the camera's height, the target may be in any row.
+fn is_masked(left: &Point2<f64>, right: &Point2<f64>, camera: &PosedCamera) -> bool {
+    let ends = BoundingBox::around(&[*left, *right]);
+    let height = f64::from(camera.intrinsics.height);
+    let target = match camera.height_m {
+        Some(_) => BoundingBox {
+            y_min: ends.y_min - ends.width(),
+            ..ends
+        },
+        None => BoundingBox {
+            y_min: -height,
+            y_max: 2.0 * height,
+            ..ends
+        },
+    };
+    camera.masks.iter().any(|mask| mask.overlaps(&target))
 }
 
 /// A perceived object that hides landmarks behind it.
@@ -296,6 +326,40 @@ mod tests {
             seen(Some(1.2), 40.0),
             ["1 m", "3 m"],
             "nor is what is above it"
+        );
+    }
+
+    #[test]
+    fn masked_landmarks_are_invisible() {
+        let intrinsics =
+            Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+        let config = ViewConfig {
+            min_target_px: 0.0,
+            ..ViewConfig::default()
+        };
+        let landmarks = [
+            landmark("left", 3.0, 1.0, None),
+            landmark("ahead", 3.0, 0.0, None),
+        ];
+        let seen = |height_m, rows: [f64; 2]| {
+            let mount = Mount {
+                height_m,
+                ..Mount::default()
+            };
+            let [top, bottom] = rows;
+            let corners = [[0.0, top], [290.0, top], [290.0, bottom], [0.0, bottom]];
+            let masks = [Polygon::new(corners.map(Point2::from).into()).unwrap()];
+            let camera =
+                PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &mount, intrinsics).with_masks(&masks);
+            landmarks_in_view(&landmarks, &camera, &[], &ObjectSizes::default(), &config)
+        };
+        // 1 m below the camera, the ground 3 m ahead is in row 416.
+        assert_eq!(seen(Some(1.0), [400.0, 480.0]), ["ahead"]);
+        assert_eq!(seen(Some(1.0), [0.0, 200.0]), ["left", "ahead"]);
+        assert_eq!(
+            seen(None, [0.0, 200.0]),
+            ["ahead"],
+            "without a height, the row is unknown"
         );
     }
 

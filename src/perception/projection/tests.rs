@@ -4,7 +4,6 @@ use proptest::prelude::*;
 mod ground;
 
 use super::*;
-use crate::model::detection::BoundingBox;
 
 const SIDE_M: f64 = 0.05;
 
@@ -243,6 +242,46 @@ fn unusable_detections_have_reasons() {
         ..whole.bounding_box
     });
     assert!(clipped(Ranging::BoxWidth, &cut_left) && !clipped(Ranging::BoxHeight, &cut_left));
+    let masked = |beyond: BoundingBox| {
+        let BoundingBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        } = beyond;
+        let corners = [
+            [x_min, y_min],
+            [x_max, y_min],
+            [x_max, y_max],
+            [x_min, y_max],
+        ];
+        let mask = Polygon::new(corners.map(Point2::from).into()).unwrap();
+        projection(Ranging::Auto).with_masks(vec![mask]).cut(&whole)
+    };
+    let bounds = whole.bounding_box;
+    let below = BoundingBox {
+        y_min: bounds.y_max,
+        y_max: 480.0,
+        x_min: bounds.x_min + 10.0,
+        x_max: bounds.x_max - 10.0,
+    };
+    let lower = Cut {
+        lower: true,
+        ..Cut::default()
+    };
+    assert_eq!(masked(below), lower);
+    let further = BoundingBox {
+        y_min: bounds.y_max + 10.0,
+        ..below
+    };
+    assert_eq!(masked(further), Cut::default());
+    let inside = BoundingBox {
+        x_min: bounds.x_min + 10.0,
+        y_min: bounds.y_min + 10.0,
+        x_max: bounds.x_min + 20.0,
+        y_max: bounds.y_min + 20.0,
+    };
+    assert_eq!(masked(inside), Cut::default(), "all sides are visible");
 
     for target in [Point3::new(0.0, 0.0, -1.0), Point3::new(f64::NAN, 0.0, 1.0)] {
         assert_eq!(
