@@ -107,6 +107,7 @@ async fn main() -> anyhow::Result<()> {
             fps: 10.0,
             looping: true,
         },
+        masks: Default::default(),
         capture: Default::default(),
         optics: OpticsConfig::default(),
         mount: Default::default(),

@@ -20,6 +20,8 @@ pub mod image_size;
 #[cfg(feature = "camera")]
 pub mod lens;
 #[cfg(feature = "camera")]
+pub mod mask;
+#[cfg(feature = "camera")]
 pub mod mount_calibration;
 #[cfg(feature = "camera")]
 pub mod perception;

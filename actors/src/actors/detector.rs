@@ -353,7 +353,7 @@ mod tests {
     use ecod::perception::camera::Intrinsics;
 
     use super::*;
-    use crate::camera::frame_source::SourceConfig;
+    use crate::camera::config::CameraConfig;
 
     /// A model that is too large for its machine: each frame takes until the test releases it.
     struct Slow(Receiver<()>);
@@ -377,14 +377,14 @@ mod tests {
 
     /// Arguments of a detector that gets ten frames a second, with reports that are used for 0.2 s.
     fn arguments(detect: impl Detect + 'static, counters: &Arc<Counters>) -> DetectorArguments {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos").into();
-        let source = SourceConfig::Images {
-            path,
-            fps: 10.0,
-            looping: true,
-        };
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos");
+        let camera: CameraConfig = toml::from_str(&format!(
+            "source = {{ kind = \"images\", path = {path:?}, looping = true }}\n\
+             detector.kind = \"placard\""
+        ))
+        .unwrap();
         DetectorArguments {
-            open: Arc::new(move || source.open(Duration::from_secs(5))),
+            open: camera.opener(Duration::from_secs(5)),
             capture: CaptureConfig::default(),
             detect: Box::new(detect),
             lens: Lens {

@@ -1,6 +1,8 @@
 //! Configuration of a vehicle's camera.
 
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::names::{NodeName, PART_MARK};
@@ -12,9 +14,12 @@ use serde::{Deserialize, Serialize};
 
 use super::calibrate::{Calibration, CalibrationError};
 use super::detect::DetectorConfig;
-use super::frame_source::SourceConfig;
-use super::frame_source::capture::CaptureConfig;
+use super::frame_source::capture::{CaptureConfig, Opener};
+use super::frame_source::masked::MaskedSource;
+use super::frame_source::{FrameError, FrameSource, SourceConfig};
+use super::image_size::ImageSize;
 use super::lens::Lens;
+use super::mask::Masks;
 
 /// A vehicle's camera and the processing of its frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -27,6 +32,10 @@ pub struct CameraConfig {
     pub name: Option<String>,
     /// Source of the camera's frames: a device, a stream or files.
     pub source: SourceConfig,
+    /// Polygons that are black in each picture, as corners in shares of its width and height. Default:
+    /// no polygons. Masks need a size or a calibration in `optics`.
+    #[serde(default, skip_serializing_if = "Masks::is_empty")]
+    pub masks: Masks,
     /// Stall timeout and retries of the source.
     #[serde(default)]
     pub capture: CaptureConfig,
@@ -121,6 +130,40 @@ impl CameraConfig {
         part.unwrap_or_else(|| vehicle.clone())
     }
 
+    /// Opens the source; may block as long as the camera does. All frames of a camera come from
+    /// here, with black masks. `timeout` applies to all sources except files.
+    ///
+    /// # Errors
+    /// Returns [`FrameError::Open`] with the source and the cause.
+    pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
+        if self.masks.is_empty() {
+            return self.source.open(timeout);
+        }
+        let origin = self.source.origin();
+        let failed = |reason: String| FrameError::Open {
+            origin: origin.clone(),
+            reason,
+        };
+        let polygons = self.masks.polygons();
+        let masks = polygons.map_err(|error| failed(error.to_string()))?;
+        let lens = self
+            .optics
+            .lens()
+            .map_err(|error| failed(error.to_string()))?;
+        Ok(Box::new(MaskedSource {
+            source: self.source.open(timeout)?,
+            masks,
+            shape: ImageSize::from(&lens.intrinsics),
+            origin,
+        }))
+    }
+
+    /// Opens the source with [`Self::open`], as often as needed.
+    pub fn opener(&self, timeout: Duration) -> Opener {
+        let camera = self.clone();
+        Arc::new(move || camera.open(timeout))
+    }
+
     /// Checks every value; files and devices are checked when they are opened.
     ///
     /// # Errors
@@ -152,6 +195,11 @@ impl CameraConfig {
         self.optics
             .validate()
             .map_err(|error| error.within("optics"))?;
+        self.masks.polygons()?;
+        if !self.masks.is_empty() && self.optics.takes_any_shape() {
+            let allowed = "the size of the picture on which `masks` were drawn, with `optics.height_px`, or                            set `optics.calibration`: frames of another shape are refused";
+            return Err(ConfigError::missing("optics.width_px", allowed));
+        }
         self.mount
             .validate()
             .map_err(|error| error.within("mount"))?;
@@ -213,12 +261,15 @@ impl OpticsConfig {
             ),
             None => Intrinsics::with_square_pixels(width, height, horizontal_rad),
         };
-        let is_any_shape =
-            self.width_px.is_none() && self.height_px.is_none() && self.vertical_fov_deg.is_none();
         Ok(Lens {
-            is_any_shape,
+            is_any_shape: self.takes_any_shape() && self.vertical_fov_deg.is_none(),
             ..Lens::ideal(intrinsics)
         })
+    }
+
+    /// True if these optics state no aspect ratio of frames.
+    fn takes_any_shape(&self) -> bool {
+        self.calibration.is_none() && self.width_px.is_none() && self.height_px.is_none()
     }
 }
 

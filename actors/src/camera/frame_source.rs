@@ -3,6 +3,7 @@
 pub mod capture;
 mod capture_clock;
 pub(crate) mod images;
+pub(super) mod masked;
 mod v4l2;
 pub mod video;
 
@@ -163,12 +164,12 @@ pub enum SourceConfig {
 }
 
 impl SourceConfig {
-    /// Opens the source; may block as long as the camera does. `timeout` applies to all sources
-    /// except files.
+    /// Opens the source of whole frames, for `CameraConfig::open`, which masks them. `timeout`
+    /// applies to all sources except files.
     ///
     /// # Errors
     /// Returns [`FrameError::Open`] with the source and the cause.
-    pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
+    pub(super) fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
             Self::V4l2 {
                 device,
@@ -203,7 +204,7 @@ impl SourceConfig {
     }
 
     /// Device, pipeline, address or path in a form that may be shown: without user and password.
-    fn origin(&self) -> String {
+    pub(super) fn origin(&self) -> String {
         match self {
             Self::V4l2 { device: path, .. }
             | Self::Video { path, .. }

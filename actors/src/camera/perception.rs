@@ -12,6 +12,7 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
+use ecod::perception::polygon::Polygon;
 use ecod::perception::projection::{
     Cut, MountCheck, Projection, ProjectionConfig, ProjectionError,
 };
@@ -20,6 +21,7 @@ use ecod::wire::{ObjectReport, PerceivedObject};
 
 use crate::camera::corner_pose::locate_target;
 use crate::camera::lens::Lens;
+use crate::camera::mask::Masks;
 
 /// A vehicle's camera and the landmarks of its cell.
 #[derive(Debug, Clone)]
@@ -51,6 +53,9 @@ pub struct Perception {
     /// First and last frame with detections since a detection last had a place.
     unplaced: Option<[Timestamp; 2]>,
     mount_check: MountCheck,
+    masks: Masks,
+    /// The masks without the distortion of the lens.
+    straight_masks: Vec<Polygon>,
     /// The angle computed from the last frame, in radians.
     mount_off_rad: Option<f64>,
 }
@@ -66,6 +71,9 @@ struct DiscardCounts {
     /// The last reason in the last report, as text.
     last_reason: Option<String>,
 }
+
+/// Number of straight pieces of a mask's edge in an image without distortion.
+const PARTS_OF_EDGE: u16 = 16;
 
 /// Time without any placed detection before this is reported.
 const UNPLACED_PATIENCE: Duration = Duration::from_secs(5);
@@ -125,8 +133,34 @@ impl Perception {
             discarded: DiscardCounts::default(),
             unplaced: None,
             mount_check: MountCheck::default(),
+            masks: Masks::default(),
+            straight_masks: Vec::new(),
             mount_off_rad: None,
         }
+    }
+
+    /// The producer for a camera with masks. A box that a mask cuts does not show the whole object,
+    /// and a masked landmark is not in view.
+    #[must_use]
+    pub fn with_masks(self, masks: Masks) -> Self {
+        let mut masked = Self { masks, ..self };
+        masked.fit_masks();
+        masked
+    }
+
+    /// Sets the masks in pixels of the present lens.
+    fn fit_masks(&mut self) {
+        if self.masks.is_empty() {
+            return;
+        }
+        let lens = self.vehicle_camera.lens;
+        let masks = self.masks.in_pixels_of((&lens.intrinsics).into());
+        let straight = |mask: &Polygon| {
+            let outline = mask.subdivided(PARTS_OF_EDGE);
+            outline.mapped(|corner| lens.undistorted(corner))
+        };
+        self.straight_masks = masks.iter().map(straight).collect();
+        self.projection = self.projection.clone().with_masks(masks);
     }
 
     /// The same producer with the numbers of reports and the counts of an earlier one.
@@ -153,6 +187,7 @@ impl Perception {
             let mount = self.vehicle_camera.mount;
             self.projection = Projection::new(config, lens.intrinsics, mount);
             self.mount_check = MountCheck::default();
+            self.fit_masks();
         }
     }
 
@@ -194,7 +229,8 @@ impl Perception {
             lens,
             ..
         } = &self.vehicle_camera;
-        let camera = PosedCamera::new(self.camera, mount, lens.intrinsics);
+        let camera =
+            PosedCamera::new(self.camera, mount, lens.intrinsics).with_masks(&self.straight_masks);
         let sizes = &self.projection.config().sizes;
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
         self.seq += 1;
@@ -299,9 +335,12 @@ impl Perception {
 mod tests {
     use ecod::model::detection::BoundingBox;
     use ecod::perception::camera::Intrinsics;
+    use ecod::perception::landmark::Landmark;
     use ecod::perception::projection::{ObjectSize, ObjectSizes, Ranging};
+    use nalgebra::Point2;
 
     use super::*;
+    use crate::camera::config::CameraConfig;
 
     #[test]
     fn unwanted_object_leaves_others_reported() {
@@ -365,6 +404,60 @@ mod tests {
             discarded,
             [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]
         );
+    }
+
+    /// A mask over the left half of the picture, in whatever size a lens has.
+    #[test]
+    fn masked_landmarks_are_not_seen() {
+        let lens = |width, height| Lens {
+            distortion: Some([-0.2, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+            ..Lens::ideal(Intrinsics::from_field_of_view(width, height, 1.0, 0.8))
+        };
+        let landmark = |id: &str, y_m: f64| Landmark {
+            id: id.into(),
+            position: Point2::new(1.0, y_m),
+            facing_rad: None,
+            vacancy: None,
+            synonyms: Vec::new(),
+        };
+        let landmarks = vec![landmark("left", 0.2), landmark("right", -0.2)];
+        let vehicle_camera = VehicleCamera {
+            node: NodeName::from_static("cam"),
+            pose: Pose::new(0.0, 0.0, 0.0),
+            mount: Mount::default(),
+            lens: lens(640, 480),
+            landmarks: Arc::new(LandmarkIndex::new(landmarks, 0.1)),
+        };
+        let gate = LandmarkGate {
+            radius_m: 0.1,
+            sigmas: 4.0,
+            floor_m: 0.05,
+        };
+        let view = ViewConfig {
+            min_target_px: 1.0,
+            ..ViewConfig::default()
+        };
+        let whole = Perception::new(vehicle_camera, ProjectionConfig::default(), view, gate);
+        let masks: CameraConfig = toml::from_str(
+            "source.kind = 'v4l2'\ndetector.kind = 'placard'\n\
+             masks = [[[0, 0], [0.5, 0], [0.5, 1], [0, 1]]]",
+        )
+        .unwrap();
+        let mut masked = whole.clone().with_masks(masks.masks);
+        let mut whole = whole;
+        for lens in [lens(640, 480), lens(1280, 960)] {
+            masked.set_lens(&lens);
+            whole.set_lens(&lens);
+            let seen = |perception: &mut Perception| {
+                let seen = perception.report(Vec::new(), Timestamp(1)).seen;
+                seen.unwrap()
+                    .iter()
+                    .map(|id| id.to_string())
+                    .collect::<Vec<_>>()
+            };
+            assert_eq!(seen(&mut whole), ["left", "right"]);
+            assert_eq!(seen(&mut masked), ["right"]);
+        }
     }
 
     #[test]

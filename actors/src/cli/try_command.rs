@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 use clap::{ArgGroup, Args};
@@ -30,8 +30,10 @@ use crate::camera::config::{CameraConfig, MountConfig, OpticsConfig};
 use crate::camera::detect::DetectorConfig;
 use crate::camera::detect::coco::CocoConfig;
 use crate::camera::detect::onnx::OnnxConfig;
-use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::CaptureConfig;
+use crate::camera::frame_source::SourceConfig;
+use crate::camera::image_size::ImageSize;
+use crate::camera::mask::Mask;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::observe::dashboard::DEFAULT_ADDRESS;
@@ -77,6 +79,10 @@ pub(super) struct TryArguments {
         allow_negative_numbers = true
     )]
     pitch: Option<f64>,
+    /// Part of the pictures that is black, as corners in shares of width and height: "0,0 0.3,0 0.3,0.4".
+    /// May be repeated
+    #[arg(long, value_name = "CORNERS", requires = "sources")]
+    mask: Vec<Mask>,
     /// Write the configuration that is used; the files of further vehicles are numbered, as in
     /// node-2.toml
     #[arg(short, long, alias = "save", value_name = "FILE")]
@@ -100,6 +106,9 @@ const STREET_IN_SOURCES: &str = "examples/street";
 
 /// Assumed height of the camera in metres, between the heights of a dashboard and of a hand.
 const CAMERA_HEIGHT_M: f64 = 1.5;
+
+/// Maximum time for the first frame, of which only the size is used.
+const FIRST_FRAME_TIME: Duration = Duration::from_secs(10);
 
 /// Time between two figures of progress.
 const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
@@ -192,6 +201,7 @@ impl TryArguments {
         CameraConfig {
             name: None,
             source,
+            masks: self.mask.clone().into(),
             capture: CaptureConfig::default(),
             optics,
             mount: MountConfig {
@@ -211,14 +221,18 @@ impl TryArguments {
     fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
         let mut configs = Vec::new();
         for (index, (name, source)) in self.named_sources().into_iter().enumerate() {
-            if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = source {
-                source
+            let mut camera = self.camera(source);
+            if !camera.masks.is_empty() {
+                state_size(&mut camera).map_err(Failure::usage)?;
+            }
+            if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = camera.source {
+                camera
                     .open(PROGRESS_PERIOD)
                     .map(drop)
                     .map_err(Failure::usage)?;
             }
             let name = NodeName::new(name).map_err(Failure::usage)?;
-            let mut config = vehicle(name, self.camera(source));
+            let mut config = vehicle(name, camera);
             config.pose.y_m -= SPACING_M * index as f64;
             configs.push(config);
         }
@@ -239,6 +253,25 @@ impl TryArguments {
         }
         Ok(configs)
     }
+}
+
+/// Sets the size of the optics to the size of the source's first frame, as masks require.
+fn state_size(camera: &mut CameraConfig) -> anyhow::Result<()> {
+    camera.masks.polygons().context("--mask")?;
+    let masks = std::mem::take(&mut camera.masks);
+    let end = Instant::now() + FIRST_FRAME_TIME;
+    let mut source = camera.open(FIRST_FRAME_TIME)?;
+    let size = loop {
+        match source.next_frame() {
+            Ok(frame) => break ImageSize::of(&frame.image),
+            Err(error) if error.is_passing() && Instant::now() < end => {}
+            Err(error) => return Err(error.into()),
+        }
+    };
+    camera.optics.width_px = Some(size.width);
+    camera.optics.height_px = Some(size.height);
+    camera.masks = masks;
+    Ok(())
 }
 
 /// The nodes of the street that comes with the program: two cameras that stay where they are.

@@ -45,12 +45,12 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
         SourceConfig::Url { .. } => "try `camera.source.url` with a player",
         _ => "set `camera.source` to an existing source",
     };
-    let source = camera.source.clone();
+    let opened = camera.clone();
     // A camera that blocks forever keeps its thread, but the program ends nevertheless.
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         // The receiver is gone after the timeout.
-        let _ = sender.send(source.open(TIMEOUT).and_then(|mut source| {
+        let _ = sender.send(opened.open(TIMEOUT).and_then(|mut source| {
             let frame = source.next_frame()?;
             Ok((frame, source.time_source()))
         }));
@@ -64,10 +64,11 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
                 let fix = "set `camera.optics` to the size of the frames, or calibrate";
                 return (Finding::broken(check, seen, fix), None);
             }
-            (
-                Finding::fine(check, format!("frames of {size}, dated by {time_source}")),
-                Some(frame),
-            )
+            let mut seen = format!("frames of {size}, dated by {time_source}");
+            if !camera.masks.is_empty() {
+                seen += &format!(", masks: {}", camera.masks.len());
+            }
+            (Finding::fine(check, seen), Some(frame))
         }
         Ok(Ok(Err(error))) => (Finding::broken(check, error.to_string(), fix), None),
         Ok(Err(_)) | Err(_) => (

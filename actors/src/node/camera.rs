@@ -46,12 +46,13 @@ pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<
         lens: lens(camera)?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
     };
-    Ok(Perception::new(
+    let perception = Perception::new(
         vehicle_camera,
         camera.projection.clone(),
         camera.view.clone(),
         gate,
-    ))
+    );
+    Ok(perception.with_masks(camera.masks.clone()))
 }
 
 /// A camera's lens.

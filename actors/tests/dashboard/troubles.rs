@@ -392,7 +392,7 @@ async fn unplaced_detections_name_reason() {
     until_reported(
         page,
         ["euclid", "", "not_placed"],
-        "the image's edge cuts the box",
+        "the image's edge or a mask cuts the box",
     )
     .await;
     node.stop().await;

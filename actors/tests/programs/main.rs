@@ -2,6 +2,8 @@
 
 #[cfg(feature = "camera")]
 mod calibrate_mount;
+#[cfg(feature = "camera")]
+mod camera_masks;
 mod cli;
 #[cfg(feature = "camera")]
 mod configuration_reference;

@@ -1,6 +1,6 @@
 //! Logs of live cells: their content, their state after a kill, and replays that reproduce the original run.
 
-mod cell;
+pub(crate) mod cell;
 mod disk;
 mod files;
 #[cfg(feature = "foxglove")]

@@ -5,8 +5,9 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
+use ecod_actors::camera::config::CameraConfig;
 use ecod_actors::camera::frame::CameraFrame;
-use ecod_actors::camera::frame_source::{SourceConfig, TimeSource};
+use ecod_actors::camera::frame_source::TimeSource;
 use ecod_actors::platform::clock;
 use opencv::core::Vec3b;
 use opencv::prelude::*;
@@ -66,9 +67,11 @@ fn taken_us(frame: &CameraFrame) -> u64 {
 #[ignore = "needs the fake camera"]
 fn capture_late() {
     let device = std::env::var("FAKE_CAMERA").unwrap();
-    let config: SourceConfig =
-        toml::from_str(&format!("kind = 'v4l2'\ndevice = '{device}'")).unwrap();
-    let mut source = config.open(Duration::from_secs(5)).unwrap();
+    let camera: CameraConfig = toml::from_str(&format!(
+        "source = {{ kind = 'v4l2', device = '{device}' }}\ndetector.kind = 'placard'"
+    ))
+    .unwrap();
+    let mut source = camera.open(Duration::from_secs(5)).unwrap();
     let mut late_us: Vec<u64> = (0..40)
         .map(|number| {
             std::thread::sleep(Duration::from_millis(number * 37 % 120));

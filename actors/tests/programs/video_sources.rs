@@ -10,9 +10,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use ecod::model::time::Timestamp;
+use ecod_actors::camera::config::CameraConfig;
 use ecod_actors::camera::frame::CameraFrame;
 use ecod_actors::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus};
-use ecod_actors::camera::frame_source::{FrameError, FrameSource, SourceConfig, TimeSource};
+use ecod_actors::camera::frame_source::{FrameError, FrameSource, TimeSource};
 use ecod_actors::camera::image_codec::encode_jpeg;
 use ecod_actors::platform::clock;
 use ecod_testkit::{PATIENCE, until_blocking as until};
@@ -30,9 +31,10 @@ fn brightness(frame: &CameraFrame) -> u8 {
     frame.image.at_2d::<Vec3b>(24, 32).unwrap()[1]
 }
 
-fn source(toml: &str) -> SourceConfig {
+/// A camera with this source.
+fn source(toml: &str) -> CameraConfig {
     assert!(Path::new(env!("CARGO_BIN_EXE_ecod-video")).is_file());
-    toml::from_str(toml).unwrap()
+    toml::from_str(&format!("detector.kind = 'placard'\n[source]\n{toml}")).unwrap()
 }
 
 fn open(toml: &str) -> Result<Box<dyn FrameSource>, FrameError> {
@@ -314,7 +316,9 @@ fn missing_pipeline_element_is_named() {
 }
 
 /// A network camera on a free port that answers every client with `answer`; returns its address.
-fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
+pub(crate) fn network_camera(
+    answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static,
+) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!(
         "http://user:hunter2@{}/stream",
@@ -347,7 +351,7 @@ fn send_pictures(mut visitor: TcpStream, pictures: &[Vec<u8>]) -> std::io::Resul
 }
 
 /// Answers the request for a stream; false if the login is missing.
-fn begin_stream(visitor: &mut TcpStream) -> std::io::Result<bool> {
+pub(crate) fn begin_stream(visitor: &mut TcpStream) -> std::io::Result<bool> {
     let request = BufReader::new(visitor.try_clone()?);
     let lines: Vec<String> = request
         .lines()
@@ -373,7 +377,11 @@ fn begin_stream(visitor: &mut TcpStream) -> std::io::Result<bool> {
 }
 
 /// `header` is one more line of the part's header with its end, or empty.
-fn send_picture(visitor: &mut TcpStream, jpeg: &[u8], header: &str) -> std::io::Result<()> {
+pub(crate) fn send_picture(
+    visitor: &mut TcpStream,
+    jpeg: &[u8],
+    header: &str,
+) -> std::io::Result<()> {
     write!(
         visitor,
         "--frame\r\nContent-Type: image/jpeg\r\n{header}Content-Length: {}\r\n\r\n",
@@ -716,7 +724,7 @@ async fn capture_ends_with_video() {
     let path = directory.path().join("clip.avi");
     write_clip(&path, 200.0);
     let source = source(&format!("kind = 'video'\npath = {path:?}"));
-    let opener = Arc::new(move || source.open(Duration::from_secs(5)));
+    let opener = source.opener(Duration::from_secs(5));
     let capture = Capture::start(opener, CaptureConfig::default()).unwrap();
     let mut last = None;
     while let Some(frame) = capture.next_frame().await {

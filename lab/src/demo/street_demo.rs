@@ -230,6 +230,7 @@ pub(crate) fn camera_node(
     let config = CameraConfig {
         name: None,
         source,
+        masks: Default::default(),
         capture: CaptureConfig::default(),
         optics: OpticsConfig {
             width_px: Some(optics.width),

@@ -64,6 +64,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
     let camera = CameraConfig {
         name: None,
         source,
+        masks: Default::default(),
         capture: CaptureConfig::default(),
         optics: OpticsConfig {
             calibration: None,

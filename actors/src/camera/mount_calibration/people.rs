@@ -47,7 +47,8 @@ impl PeopleWatch {
         }
     }
 
-    /// Adds the detections of a frame of this size. Boxes that the image's edge cuts are left out.
+    /// Adds the detections of a frame of this size. Boxes that the image's edge or a
+    /// mask cuts are left out.
     ///
     /// # Errors
     /// Returns [`SizeMismatch`] if the frame does not have the shape of the lens.
@@ -63,6 +64,11 @@ impl PeopleWatch {
             self.lens.intrinsics,
             self.camera.mount.into(),
         );
+        let masks = self
+            .camera
+            .masks
+            .in_pixels_of((&self.lens.intrinsics).into());
+        let projection = projection.with_masks(masks);
         let others = detections.iter().filter(|other| other.label != self.label);
         self.others.extend(others.map(|other| other.label.clone()));
         detections.retain(|person| {

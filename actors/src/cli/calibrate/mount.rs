@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
@@ -425,17 +424,16 @@ impl PeopleArguments {
         size: ObjectSize,
     ) -> Result<PeopleWatch, Failure> {
         let mut detector = camera.detector.build().map_err(Failure::usage)?;
-        let source = camera.source.clone();
         let capture = camera.capture.clone();
         let timeout = node::camera::open_timeout(&camera);
-        source.open(timeout).map(drop).map_err(Failure::usage)?;
+        camera.open(timeout).map(drop).map_err(Failure::usage)?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_time()
             .build()
             .context("cannot start")?;
         let for_s = Duration::try_from_secs_f64(self.for_s).map_err(Failure::usage)?;
-        let capture = Capture::start(Arc::new(move || source.open(timeout)), capture)
-            .context("cannot start the camera")?;
+        let capture =
+            Capture::start(camera.opener(timeout), capture).context("cannot start the camera")?;
         let mut watched = PeopleWatch::new(camera, lens, self.label.clone().into(), size);
         let end = Instant::now() + for_s;
         eprintln!("watches for {} s, or until the frames end", self.for_s);

@@ -39,12 +39,14 @@ impl NodeBuilder {
     /// Arguments of the detector of a camera, by its place.
     pub(super) fn detector_arguments(&self, place: usize) -> anyhow::Result<DetectorArguments> {
         let camera = self.camera(place)?;
-        let source = camera.source.clone();
-        let timeout = camera::open_timeout(camera);
         let record = self.config.record.as_ref();
         let log = self.vehicle.log.subscribe();
+        if !camera.masks.is_empty() {
+            let reporter = camera.reporter(&self.name);
+            tracing::info!(camera = %reporter, masks = camera.masks.len(), "masked parts of the picture are black");
+        }
         Ok(DetectorArguments {
-            open: Arc::new(move || source.open(timeout)),
+            open: camera.opener(camera::open_timeout(camera)),
             capture: camera.capture.clone(),
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
