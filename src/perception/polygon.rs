@@ -4,7 +4,7 @@ use nalgebra::Point2;
 
 use crate::model::detection::BoundingBox;
 
-/// A polygon whose edges do not cross; x grows to the right, y downwards.
+/// A polygon whose edges do not cross or touch; x grows to the right, y downwards.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Polygon {
     corners: Vec<Point2<f64>>,
@@ -19,8 +19,8 @@ pub enum PolygonError {
     /// A corner is NaN or infinite.
     #[error("corner {0} without a finite place")]
     NotFinite(usize),
-    /// Two edges cross; each number is of the corner at which the edge begins, from 0.
-    #[error("edges from corners {first} and {second} that cross")]
+    /// Two edges cross or touch; each number is of the corner at which the edge begins, from 0.
+    #[error("edges from corners {first} and {second} that cross or touch")]
     Crossing {
         /// The earlier edge.
         first: usize,
@@ -50,10 +50,26 @@ impl Edge {
         self.side(&other.from) * self.side(&other.to) < 0.0
             && other.side(&self.from) * other.side(&self.to) < 0.0
     }
+
+    /// True if `point` is on this edge.
+    fn has(&self, point: &Point2<f64>) -> bool {
+        let between = |a: f64, b: f64, value: f64| (a.min(b)..=a.max(b)).contains(&value);
+        self.side(point) == 0.0
+            && between(self.from.x, self.to.x, point.x)
+            && between(self.from.y, self.to.y, point.y)
+    }
+
+    /// True if the edges have a point in common.
+    fn meets(&self, other: &Self) -> bool {
+        self.crosses(other)
+            || [other.from, other.to].iter().any(|end| self.has(end))
+            || [self.from, self.to].iter().any(|end| other.has(end))
+    }
 }
 
 impl Polygon {
-    /// A polygon with these corners in order, clockwise or counter-clockwise.
+    /// A polygon with these corners in order, clockwise or counter-clockwise. A corner that repeats
+    /// the one before, as at the end of a closed ring, is ignored.
     ///
     /// # Errors
     /// Returns a [`PolygonError`] if the corners enclose no area, or it is unclear which.
@@ -65,24 +81,33 @@ impl Polygon {
         if let Some(index) = corners.iter().position(|corner| !is_finite(corner)) {
             return Err(PolygonError::NotFinite(index));
         }
-        let polygon = Self { corners };
-        let edges: Vec<Edge> = polygon.edges().collect();
-        for (first, edge) in edges.iter().enumerate() {
-            let crossed = |other: &Edge| edge.crosses(other);
-            if let Some(later) = edges[first + 1..].iter().position(crossed) {
-                let second = first + 1 + later;
-                return Err(PolygonError::Crossing { first, second });
-            }
-        }
-        let base = edges.iter().find(|edge| edge.from != edge.to);
-        let is_flat = base.is_none_or(|base| {
+        let numbered: Vec<(usize, Edge)> = edges(&corners)
+            .enumerate()
+            .filter(|(_, edge)| edge.from != edge.to)
+            .collect();
+        let is_flat = numbered.first().is_none_or(|(_, base)| {
             let is_on_line = |corner: &Point2<f64>| base.side(corner) == 0.0;
-            polygon.corners.iter().all(is_on_line)
+            corners.iter().all(is_on_line)
         });
         if is_flat {
             return Err(PolygonError::Flat);
         }
-        Ok(polygon)
+        let last = numbered.len() - 1;
+        for (place, (first, edge)) in numbered.iter().enumerate() {
+            // The next edge begins where this one ends, and the last edge ends where the first begins.
+            let others = numbered.iter().enumerate().skip(place + 2);
+            let met = others
+                .filter(|(other_place, _)| place > 0 || *other_place < last)
+                .find(|(_, (_, other))| edge.meets(other));
+            if let Some((_, (second, _))) = met {
+                return Err(PolygonError::Crossing {
+                    first: *first,
+                    second: *second,
+                });
+            }
+        }
+        let corners = numbered.iter().map(|(_, edge)| edge.from).collect();
+        Ok(Self { corners })
     }
 
     /// The corners in order.
@@ -207,6 +232,18 @@ mod tests {
                 second: 3
             }
         );
+    }
+
+    /// Outlines by which a point is inside twice, and would not be covered.
+    #[test]
+    fn touching_edges_are_refused() {
+        let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+        let twice = [square, square].concat();
+        let through_corner = [[0.0, 0.0], [0.5, 0.5], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]];
+        for corners in [&twice[..], &through_corner] {
+            let error = polygon(corners).unwrap_err();
+            assert!(matches!(error, PolygonError::Crossing { .. }), "{error}");
+        }
     }
 
     #[test]

@@ -197,7 +197,7 @@ impl CameraConfig {
             .map_err(|error| error.within("optics"))?;
         self.masks.polygons()?;
         if !self.masks.is_empty() && self.optics.takes_any_shape() {
-            let allowed = "the size of the picture on which `masks` were drawn, with `optics.height_px`, or                            set `optics.calibration`: frames of another shape are refused";
+            let allowed = "the width of the picture on which `masks` were drawn: set both sizes or `optics.calibration`, because frames of another shape are refused";
             return Err(ConfigError::missing("optics.width_px", allowed));
         }
         self.mount

@@ -118,7 +118,7 @@ fn polygon(corners: &[[f64; 2]]) -> Result<Polygon, ConfigError> {
     Polygon::new(corners.iter().copied().map(Point2::from).collect()).map_err(|error| {
         let allowed = match error {
             PolygonError::Crossing { .. } => {
-                "a polygon whose edges do not cross: list its corners in order around the area"
+                "a polygon whose edges do not cross or touch: list its corners in order around the area"
             }
             _ => "a polygon of at least 3 corners [x, y] around an area",
         };
@@ -171,7 +171,7 @@ mod tests {
             ),
             (
                 &[[0.1, 0.1], [0.2, 0.1], [0.1, 0.2], [0.2, 0.2]],
-                "`masks[1]`: a polygon with edges from corners 1 and 3 that cross",
+                "`masks[1]`: a polygon with edges from corners 1 and 3 that cross or touch",
                 "in order around the area",
             ),
         ];

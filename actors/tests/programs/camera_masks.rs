@@ -1,4 +1,4 @@
-//! Masked parts of a camera's picture reach neither detector, page nor disk.
+//! Masked parts of a camera's picture stay out of detector, page and disk.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};

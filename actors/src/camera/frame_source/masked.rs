@@ -56,8 +56,8 @@ const SHIFT: i32 = 4;
 /// middle is inside; with the outline, pixels that are partly inside are black, too.
 const OUTLINE_PX: i32 = 3;
 
-/// Blackens each pixel that a mask touches, in pixels of the image. Masks are drawn one by one:
-/// where two of them overlap, OpenCV would leave a hole.
+/// Blackens each pixel that a mask touches, in pixels of the image. Each mask is drawn
+/// separately: where two masks overlap, OpenCV would leave a hole.
 fn blacken(image: &mut Mat, mask: &Polygon) -> opencv::Result<()> {
     // The middle of the first pixel is at 0.5 in masks, and at 0 in OpenCV.
     let fixed_point = |pixels: f64| ((pixels - 0.5) * f64::from(1 << SHIFT)).round() as i32;

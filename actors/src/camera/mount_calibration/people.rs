@@ -47,8 +47,8 @@ impl PeopleWatch {
         }
     }
 
-    /// Adds the detections of a frame of this size. Boxes that the image's edge or a
-    /// mask cuts are left out.
+    /// Adds the detections of a frame of this size. Boxes that the image's edge or a mask
+    /// cuts are left out.
     ///
     /// # Errors
     /// Returns [`SizeMismatch`] if the frame does not have the shape of the lens.
