@@ -73,7 +73,7 @@ impl Polygon {
     ///
     /// # Errors
     /// Returns a [`PolygonError`] if the corners enclose no area, or it is unclear which.
-    pub fn new(corners: Vec<Point2<f64>>) -> Result<Self, PolygonError> {
+    pub fn new(corners: &[Point2<f64>]) -> Result<Self, PolygonError> {
         if corners.len() < 3 {
             return Err(PolygonError::TooFewCorners(corners.len()));
         }
@@ -81,7 +81,7 @@ impl Polygon {
         if let Some(index) = corners.iter().position(|corner| !is_finite(corner)) {
             return Err(PolygonError::NotFinite(index));
         }
-        let numbered: Vec<(usize, Edge)> = edges(&corners)
+        let numbered: Vec<(usize, Edge)> = edges(corners)
             .enumerate()
             .filter(|(_, edge)| edge.from != edge.to)
             .collect();
@@ -195,7 +195,8 @@ mod tests {
     use super::*;
 
     fn polygon(corners: &[[f64; 2]]) -> Result<Polygon, PolygonError> {
-        Polygon::new(corners.iter().copied().map(Point2::from).collect())
+        let corners: Vec<_> = corners.iter().copied().map(Point2::from).collect();
+        Polygon::new(&corners)
     }
 
     fn area(x_min: f64, y_min: f64, x_max: f64, y_max: f64) -> BoundingBox {

@@ -348,7 +348,7 @@ mod tests {
             };
             let [top, bottom] = rows;
             let corners = [[0.0, top], [290.0, top], [290.0, bottom], [0.0, bottom]];
-            let masks = [Polygon::new(corners.map(Point2::from).into()).unwrap()];
+            let masks = [Polygon::new(&corners.map(Point2::from)).unwrap()];
             let camera =
                 PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &mount, intrinsics).with_masks(&masks);
             landmarks_in_view(&landmarks, &camera, &[], &ObjectSizes::default(), &config)

@@ -115,7 +115,8 @@ fn polygon(corners: &[[f64; 2]]) -> Result<Polygon, ConfigError> {
         let found = format!("a polygon of {} corners", corners.len());
         return Err(ConfigError::new("", found, allowed));
     }
-    Polygon::new(corners.iter().copied().map(Point2::from).collect()).map_err(|error| {
+    let corners: Vec<_> = corners.iter().copied().map(Point2::from).collect();
+    Polygon::new(&corners).map_err(|error| {
         let allowed = match error {
             PolygonError::Crossing { .. } => {
                 "a polygon whose edges do not cross or touch: list its corners in order around the area"

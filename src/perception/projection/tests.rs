@@ -255,7 +255,7 @@ fn unusable_detections_have_reasons() {
             [x_max, y_max],
             [x_min, y_max],
         ];
-        let mask = Polygon::new(corners.map(Point2::from).into()).unwrap();
+        let mask = Polygon::new(&corners.map(Point2::from)).unwrap();
         projection(Ranging::Auto).with_masks(vec![mask]).cut(&whole)
     };
     let bounds = whole.bounding_box;

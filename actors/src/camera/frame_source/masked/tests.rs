@@ -70,7 +70,8 @@ fn assert_covers(frame: &CameraFrame, masks: &[Polygon]) {
 }
 
 fn mask(corners: &[[f64; 2]]) -> Polygon {
-    Polygon::new(corners.iter().copied().map(Point2::from).collect()).unwrap()
+    let corners: Vec<_> = corners.iter().copied().map(Point2::from).collect();
+    Polygon::new(&corners).unwrap()
 }
 
 proptest! {
@@ -79,10 +80,11 @@ proptest! {
         corners in prop::collection::vec([0.0..=1.0, 0.0..=1.0f64], 3..8),
         scale in 1u32..4,
     ) {
-        let corners = corners.into_iter().map(Point2::from).collect();
+        let corners: Vec<_> = corners.into_iter().map(Point2::from).collect();
         // Corners at random usually cross from six on.
-        prop_assume!(Polygon::new(Vec::clone(&corners)).is_ok());
-        let masks = vec![Polygon::new(corners).unwrap()];
+        let polygon = Polygon::new(&corners);
+        prop_assume!(polygon.is_ok());
+        let masks = vec![polygon.unwrap()];
         let size = ImageSize { width: 64 * scale, height: 48 * scale };
         let frame = masked(size, masks.clone()).unwrap();
         assert_covers(&frame, &masks);
