@@ -176,7 +176,8 @@ impl RoundFilter {
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
 
-    /// Accepts or refuses reputations. They are a state, so their age does not matter.
+    /// Accepts or refuses reputations. They are a state, so their age does not matter: after a stall, one that waited in
+    /// a queue may precede one of many rounds later. Maps and verdicts show that these rounds were published.
     ///
     /// # Errors
     /// Returns the reason for the refusal.
@@ -192,6 +193,11 @@ impl RoundFilter {
             reputations.aggregator.clone().unwrap_or(UNNAMED),
         );
         self.check_origin(&epoch, origin)?;
+        let rounds = [&self.maps, &self.verdicts];
+        let possible = rounds.map(|rounds| rounds.last_possible(&epoch, received_at));
+        if let Some(last) = possible.into_iter().flatten().max() {
+            self.reputations.on_published(&epoch, last);
+        }
         self.reputations
             .admit(&epoch, reputations.round, received_at, leadership)?;
         self.record_origin(&epoch, origin);
@@ -365,6 +371,47 @@ mod tests {
             take(&mut filter, &map(7, 31, at(31)), resumed, &seeking),
             Ok(())
         );
+    }
+
+    /// A node stands still for 11 s. The reputations that waited and those of the current round arrive together.
+    #[test]
+    fn reputations_follow_queued_ones() {
+        let mut filter = RoundFilter::new(0, ms(0));
+        let leadership = following(8, "edge");
+        let at = |round: u64| ms(100 * round);
+        let reputations = |round| Reputations {
+            schema: SCHEMA_VERSION,
+            aggregator: Some(NodeName::from_static("edge")),
+            epoch: 8,
+            round,
+            reputations: Default::default(),
+        };
+        for round in 0..10 {
+            take(
+                &mut filter,
+                &map(8, round, at(round)),
+                at(round),
+                &leadership,
+            )
+            .unwrap();
+        }
+        let mut accept = |filter: &mut RoundFilter, round, now| {
+            let accepted =
+                filter.accept_reputations(&reputations(round), Origin::Claimed, now, &leadership);
+            accepted.map(|_| ())
+        };
+        assert_eq!(accept(&mut filter, 1, at(1)), Ok(()));
+        assert_eq!(accept(&mut filter, 9, at(9)), Ok(()));
+        let resumed = at(120);
+        let waited = take(&mut filter, &map(8, 11, at(11)), resumed, &leadership);
+        assert_eq!(waited, Err(Refusal::Stale));
+        assert_eq!(accept(&mut filter, 11, resumed), Ok(()), "it waited, too");
+        assert_eq!(accept(&mut filter, 119, resumed), Ok(()));
+        let now = at(121);
+        let next = accept(&mut filter, 90_000, now);
+        assert_eq!(next, Err(Refusal::Implausible));
+        take(&mut filter, &map(8, 121, now), now, &leadership).unwrap();
+        assert_eq!(accept(&mut filter, 121, now), Ok(()));
     }
 
     #[test]

@@ -52,6 +52,8 @@ pub struct SuccessionFilter {
     overruled: Option<NodeName>,
     /// The publisher of a term that the election has not seen, while there is no leader.
     stranger: Option<Stranger>,
+    /// A leadership and the last round that it can have published, by the leader's messages on other topics.
+    published: Option<(Epoch, u64)>,
 }
 
 /// The leader that the election named last.
@@ -98,6 +100,7 @@ impl SuccessionFilter {
             others_since: None,
             overruled: None,
             stranger: None,
+            published: None,
         }
     }
 
@@ -154,6 +157,32 @@ impl SuccessionFilter {
     /// queue, and the leader may have published many rounds meanwhile.
     pub(super) fn on_stale(&mut self) {
         self.fresh_at = self.earlier_fresh_at;
+    }
+
+    /// The last round that `epoch` can have published by `received_at`, if its message was the last on this topic.
+    pub(super) fn last_possible(&self, epoch: &Epoch, received_at: Timestamp) -> Option<u64> {
+        let (_, last) = self.gate.latest().filter(|(latest, _)| *latest == epoch)?;
+        let fresh_at = self.fresh_at.unwrap_or(received_at);
+        Some(
+            last.saturating_add(MAX_ROUNDS_AHEAD)
+                .saturating_add(max_rounds_in(received_at.since(fresh_at))),
+        )
+    }
+
+    /// Processes that another topic shows that `epoch` can have published rounds up to `round`.
+    pub(super) fn on_published(&mut self, epoch: &Epoch, round: u64) {
+        self.published = Some((epoch.clone(), round));
+    }
+
+    /// True if `epoch` cannot have published this round yet.
+    fn is_implausible(&self, epoch: &Epoch, round: u64, received_at: Timestamp) -> bool {
+        let by_others = self
+            .published
+            .as_ref()
+            .filter(|(published, _)| published == epoch)
+            .map_or(0, |(_, last)| *last);
+        self.last_possible(epoch, received_at)
+            .is_some_and(|last| round > last.max(by_others))
     }
 
     /// True if an unconfirmed epoch must not be accepted yet.
@@ -287,18 +316,8 @@ impl SuccessionFilter {
         let is_first = self.gate.latest().is_none();
         let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
         let quiet = silence >= EPOCH_MEMORY;
-        let fresh_at = *self.fresh_at.get_or_insert(received_at);
-        let limit = |last: u64| {
-            last.saturating_add(MAX_ROUNDS_AHEAD)
-                .saturating_add(max_rounds_in(received_at.since(fresh_at)))
-        };
-        if !quiet
-            && !self.newest_is_retained
-            && self
-                .gate
-                .latest()
-                .is_some_and(|(latest, last)| latest == epoch && round > limit(last))
-        {
+        self.fresh_at.get_or_insert(received_at);
+        if !quiet && !self.newest_is_retained && self.is_implausible(epoch, round, received_at) {
             return Err(Refusal::Implausible);
         }
         let mut admitted = self.gate.admit(epoch, round);
