@@ -22,6 +22,8 @@ pub(super) struct DetectionHistory {
     /// large.
     sensors: SmallVec<[SensorId; 12]>,
     histories: Vec<SensorHistory>,
+    /// Time until which no slot becomes free, once all are in use: a lower bound, because later observations extend it.
+    occupied_until: Timestamp,
 }
 
 impl DetectionHistory {
@@ -50,9 +52,10 @@ impl DetectionHistory {
             .map_or(ObservationState::First, |history| history.state)
     }
 
-    /// Whether a vehicle has a slot or can have one.
-    pub(super) fn has_room(&self, sensor: SensorId, at: Timestamp) -> bool {
-        self.find_slot(sensor, at).is_some()
+    /// Whether a vehicle without a slot can have one.
+    pub(super) fn has_room(&self, at: Timestamp) -> bool {
+        self.histories.len() < MAX_SLOTS
+            || at > self.occupied_until && self.next_free().is_some_and(|(_, until)| at > until)
     }
 
     /// The history of a vehicle that observes the place of the object, if there is room for the history.
@@ -71,12 +74,11 @@ impl DetectionHistory {
         sensor: SensorId,
         at: Timestamp,
     ) -> Option<&mut SensorHistory> {
-        let without_hit = || {
+        let slot = self.find_slot(sensor, at).or_else(|| {
             self.histories
                 .iter()
                 .position(|history| history.last_hit.is_none())
-        };
-        let slot = self.find_slot(sensor, at).or_else(without_hit)?;
+        })?;
         Some(self.occupy(slot, sensor, at))
     }
 
@@ -106,6 +108,7 @@ impl DetectionHistory {
                 _ => {}
             }
         }
+        self.renew_bound();
     }
 
     fn slot_of(&self, sensor: SensorId) -> Option<usize> {
@@ -113,18 +116,32 @@ impl DetectionHistory {
     }
 
     /// The slot that a vehicle has or can have; `None` while all are in use.
-    fn find_slot(&self, sensor: SensorId, at: Timestamp) -> Option<usize> {
-        let unused = || Some(self.histories.len()).filter(|count| *count < MAX_SLOTS);
-        let expired = || {
-            let observations = self
-                .histories
-                .iter()
-                .map(|history| history.observed_at)
-                .enumerate();
-            let (oldest, observed_at) = observations.min_by_key(|(_, observed_at)| *observed_at)?;
-            (at.since(observed_at) > SLOT_KEPT).then_some(oldest)
-        };
-        self.slot_of(sensor).or_else(unused).or_else(expired)
+    fn find_slot(&mut self, sensor: SensorId, at: Timestamp) -> Option<usize> {
+        let mut free = Some(self.histories.len()).filter(|count| *count < MAX_SLOTS);
+        if free.is_none() && at > self.occupied_until {
+            let (slot, until) = self.next_free()?;
+            self.occupied_until = until;
+            free = (at > until).then_some(slot);
+        }
+        self.slot_of(sensor).or(free)
+    }
+
+    /// The slot that becomes free next, and the time until which it is in use.
+    fn next_free(&self) -> Option<(usize, Timestamp)> {
+        let observations = self.histories.iter().map(|history| history.observed_at);
+        let (slot, observed_at) = observations
+            .enumerate()
+            .min_by_key(|(_, observed_at)| *observed_at)?;
+        Some((slot, observed_at + SLOT_KEPT))
+    }
+
+    /// Renews the bound after a slot changes its vehicle.
+    fn renew_bound(&mut self) {
+        if self.histories.len() == MAX_SLOTS
+            && let Some((_, until)) = self.next_free()
+        {
+            self.occupied_until = until;
+        }
     }
 
     /// The history in a slot; a slot of another vehicle starts anew for `sensor`.
@@ -132,9 +149,11 @@ impl DetectionHistory {
         if slot == self.histories.len() {
             self.sensors.push(sensor);
             self.histories.push(SensorHistory::new(sensor, at));
+            self.renew_bound();
         } else if self.sensors[slot] != sensor {
             self.sensors[slot] = sensor;
             self.histories[slot] = SensorHistory::new(sensor, at);
+            self.renew_bound();
         }
         &mut self.histories[slot]
     }

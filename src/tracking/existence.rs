@@ -280,9 +280,9 @@ impl SensorHistory {
         }
     }
 
-    /// Records an observation of the object's place without a detection.
-    pub(super) fn miss(&mut self, at: Timestamp, rates: &ObservationRates) {
-        self.observe(at, rates.nats(false));
+    /// Records an observation of the object's place without a detection. `nats` is the evidence of the result.
+    pub(super) fn miss(&mut self, at: Timestamp, nats: f64) {
+        self.observe(at, nats);
         self.state = self.state.after(false);
     }
 
@@ -291,10 +291,11 @@ impl SensorHistory {
         self.unjudged.observations += 1;
     }
 
-    /// Counts a miss without occlusion as evidence that the object does not exist.
-    pub(super) fn deny(&mut self, rates: &ObservationRates) {
-        self.absence = (self.absence + rates.nats(false)).max(-MAX_PEER_NATS);
-        self.is_view_known = rates.has_pose;
+    /// Counts a miss without occlusion as evidence that the object does not exist; `nats` is the evidence of the result,
+    /// `has_pose` is true if the vehicle states its pose.
+    pub(super) fn deny(&mut self, nats: f64, has_pose: bool) {
+        self.absence = (self.absence + nats).max(-MAX_PEER_NATS);
+        self.is_view_known = has_pose;
     }
 
     /// Fades earlier evidence and counts an observation.

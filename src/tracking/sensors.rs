@@ -248,13 +248,21 @@ impl SensorModel {
         reported: &Vector2<f64>,
         state: ObservationState,
     ) -> ObservationRates {
-        match self.coverage.rates_at(reported) {
-            Some(object) => self.rates(object, state),
-            None => self.rates(&DetectionRates::object(), state),
-        }
+        self.observation_rates(reported, state)
+            .unwrap_or_else(|| self.rates_out_of_view(state))
     }
 
-    fn rates(&self, object: &DetectionRates, state: ObservationState) -> ObservationRates {
+    /// Rates at a detection in this state outside the field of view.
+    pub(super) fn rates_out_of_view(&self, state: ObservationState) -> ObservationRates {
+        self.rates(&DetectionRates::object(), state)
+    }
+
+    /// Rates at an observation in this state, by the detection rates of objects at its place.
+    pub(super) fn rates(
+        &self,
+        object: &DetectionRates,
+        state: ObservationState,
+    ) -> ObservationRates {
         ObservationRates {
             object: object.rate(state),
             clutter: self.clutter.rate(state),

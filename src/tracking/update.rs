@@ -4,13 +4,14 @@
 //! detections of all vehicles with tracks, updates each track once with all its detections, weighs the observations of
 //! every vehicle, updates the sensor models, and spawns tracks from the remaining detections.
 
+use hashbrown::HashMap;
 use nalgebra::{Matrix2, Vector2};
 use smallvec::SmallVec;
 
 use super::assignment::{Assignment, Hypothesis};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
-use super::existence::{ExistenceStatement, ObservationRates, ObservationState, logistic};
+use super::existence::{ExistenceStatement, ObservationState, logistic};
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
@@ -54,9 +55,12 @@ struct TrackObservation {
     detection: Option<usize>,
     /// The position at which the vehicle would have reported the object, metres.
     place: Vector2<f64>,
-    rates: ObservationRates,
+    /// Evidence of the result, nats.
+    nats: f64,
     /// State before the observation.
     state: ObservationState,
+    /// True if the vehicle states its pose.
+    has_pose: bool,
     /// True if the place is in the field of view.
     is_in_view: bool,
     /// True if another detection of the vehicle may hide the place.
@@ -179,7 +183,7 @@ impl InstantUpdate<'_> {
     /// All observations of the instant: detections, and misses of the tracks in view.
     fn observations(&self, scans: &[Scan<'_>], hypotheses: &[Hypothesis]) -> Vec<TrackObservation> {
         let mut detected: Vec<Vec<TrackIndex>> = vec![Vec::new(); scans.len()];
-        let mut observations = Vec::new();
+        let mut observations = Vec::with_capacity(self.tracks.len());
         for hypothesis in hypotheses {
             let Some(track) = hypothesis.track else {
                 continue;
@@ -193,14 +197,17 @@ impl InstantUpdate<'_> {
                 };
                 let place = scan.detections[detection].reported;
                 let state = history.state_of(scan.sensor);
+                let in_view = sensor.observation_rates(&place, state);
+                let rates = in_view.unwrap_or_else(|| sensor.rates_out_of_view(state));
                 observations.push(TrackObservation {
                     track,
                     scan: number,
                     detection: Some(detection),
                     place,
-                    rates: sensor.hit_rates(&place, state),
+                    nats: rates.nats(true),
                     state,
-                    is_in_view: sensor.coverage.rates_at(&place).is_some(),
+                    has_pose: rates.has_pose,
+                    is_in_view: in_view.is_some(),
                     is_hidden: false,
                 });
             }
@@ -230,29 +237,31 @@ impl InstantUpdate<'_> {
         let since_indexed_s = self.tracks.seconds_since_indexed(self.at);
         let reach_m = sensor.coverage.range_m() + self.tracks.slack_m(self.at);
         self.tracks.near(&centre, reach_m, |indexed| {
-            if detected.binary_search(&indexed.track).is_ok() {
-                return;
-            }
             let place = indexed.position + indexed.velocity * since_indexed_s;
-            let track = &self.tracks[indexed.track];
-            let history = track.history.get(scan.sensor);
-            let state = track.history.state_of(scan.sensor);
-            let Some(rates) = sensor.observation_rates(&place, state) else {
+            let Some(object) = sensor.coverage.rates_at(&place) else {
                 return;
             };
-            let has_jumped = (track.state.position_at(self.at) - place).norm() > self.config.gate_m;
-            let is_stale = history.is_some_and(|history| history.observed_at >= self.at);
-            let has_room = history.is_some() || track.history.has_room(scan.sensor, self.at);
-            if track.vehicle == Some(scan.sensor) || has_jumped || is_stale || !has_room {
+            let track = &self.tracks[indexed.track];
+            let history = track.history.get(scan.sensor);
+            let has_room = history.is_some() || track.history.has_room(self.at);
+            if !has_room || detected.binary_search(&indexed.track).is_ok() {
                 return;
             }
+            let has_jumped = (track.state.position_at(self.at) - place).norm() > self.config.gate_m;
+            let is_stale = history.is_some_and(|history| history.observed_at >= self.at);
+            if track.vehicle == Some(scan.sensor) || has_jumped || is_stale {
+                return;
+            }
+            let state = history.map_or(ObservationState::First, |history| history.state);
+            let rates = sensor.rates(object, state);
             observations.push(TrackObservation {
                 track: indexed.track,
                 scan: number,
                 detection: None,
                 place,
-                rates,
+                nats: rates.nats(false),
                 state,
+                has_pose: rates.has_pose,
                 is_in_view: true,
                 is_hidden: scan.occlusion.hides(&place),
             });
@@ -315,13 +324,14 @@ impl InstantUpdate<'_> {
             track.state.adapt(innovation.distance_squared / MANOEUVRE);
         }
         track.state.update(at, &measurement);
+        let is_only_hit = hits().filter(|(scan, _)| scan.is_trusted()).count() == 1;
         for (scan, detection) in hits().filter(|(scan, _)| scan.is_trusted()) {
             let Some(velocity) = velocity_stated(self.sensors, scan, detection) else {
                 continue;
             };
             let fleet = &self.sensors.fleet;
-            let is_only_witness = hits().filter(|(scan, _)| scan.is_trusted()).count() == 1
-                && !track.is_detected_by_others(scan.sensor, |id| fleet.trust(id));
+            let is_only_witness =
+                is_only_hit && !track.is_detected_by_others(scan.sensor, |id| fleet.trust(id));
             let is_admitted = if is_only_witness {
                 prior.is_possible(&velocity)
             } else {
@@ -384,7 +394,7 @@ impl InstantUpdate<'_> {
             let scan = &scans[observation.scan];
             let track = &mut self.tracks[observation.track];
             track.predict_existence(at, self.leaving_hz);
-            let nats = observation.rates.nats(observation.detection.is_some());
+            let nats = observation.nats;
             if observation.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
             }
@@ -410,27 +420,22 @@ impl InstantUpdate<'_> {
                     .history
                     .for_observation(scan.sensor, at)
                     .and_then(|history| {
-                        history.miss(at, &observation.rates);
+                        history.miss(at, nats);
                         if !observation.is_hidden {
                             history.state_miss();
-                            history.deny(&observation.rates);
+                            history.deny(nats, observation.has_pose);
                         }
                         history.take_due(at)
                     }),
             };
             due.extend(statement.map(|statement| (number, statement)));
         }
-        let mut seen: Vec<TrackIndex> = observations
-            .iter()
-            .map(|observation| observation.track)
-            .collect();
-        seen.sort_unstable();
-        seen.dedup();
-        for track in seen {
-            self.tracks[track].record_detected(at);
-        }
+        let mut existences = HashMap::with_capacity(observations.len().min(self.tracks.len()));
         for observation in observations {
-            self.learn(observation, &scans[observation.scan]);
+            let exists = *existences
+                .entry(observation.track)
+                .or_insert_with(|| self.conclude(observation.track));
+            self.learn(observation, &scans[observation.scan], exists);
         }
         for (number, statement) in due {
             let observation = &observations[number];
@@ -443,18 +448,26 @@ impl InstantUpdate<'_> {
         }
     }
 
-    /// Updates rates and calibration with an observation and the existence after all observations of the instant.
-    fn learn(&mut self, observation: &TrackObservation, scan: &Scan<'_>) {
-        let track = &mut self.tracks[observation.track];
-        if track.vehicle.is_some() {
-            return;
-        }
+    /// Concludes from all observations of a track in the instant; returns the probability that its object exists.
+    fn conclude(&mut self, index: TrackIndex) -> f64 {
+        let track = &mut self.tracks[index];
+        track.record_detected(self.at);
         let fleet = &self.sensors.fleet;
         let denied = track.denied_nats(self.at, |id| fleet.trust(id));
         let exists = logistic(track.existence.log_odds() + denied.unwrap_or(0.0));
-        if track.is_confirmed() && exists > CERTAIN && !track.is_settled {
+        let is_object = track.vehicle.is_none() && track.is_confirmed() && exists > CERTAIN;
+        if is_object && !track.is_settled {
             track.is_settled = true;
             self.sensors.settle(track.spawned_by, true);
+        }
+        exists
+    }
+
+    /// Updates rates and calibration with an observation of an object that `exists` with a probability.
+    fn learn(&mut self, observation: &TrackObservation, scan: &Scan<'_>, exists: f64) {
+        let track = &self.tracks[observation.track];
+        if track.vehicle.is_some() {
+            return;
         }
         let is_hit = observation.detection.is_some();
         let is_evident = track.is_confirmed()
@@ -485,7 +498,6 @@ impl InstantUpdate<'_> {
         evidence: &mut Vec<Evidence>,
     ) {
         let track = &self.tracks[observation.track];
-        let label = track.label(self.config);
         let (sensor, fleet) = match self.sensors.with_fleet(vehicle) {
             Some(both) => both,
             None => return,
@@ -508,7 +520,7 @@ impl InstantUpdate<'_> {
         fleet.count(vehicle, &mut sensor.counts, correct);
         evidence.push(Evidence {
             node: sensor.node.clone(),
-            label,
+            label: track.label(self.config),
             correct,
         });
     }
@@ -555,7 +567,7 @@ impl InstantUpdate<'_> {
             } else if let Some(rates) = sensor.observation_rates(&position, state)
                 && let Some(history) = neighbour.history.for_observation(id, at)
             {
-                history.miss(at, &rates);
+                history.miss(at, rates.nats(false));
             }
         }
         self.neighbours.judge(&self.sensors.fleet, at);
@@ -635,8 +647,11 @@ impl InstantUpdate<'_> {
                 history.hit(at, own_position, nats, detection.confidence_nats);
             }
         }
-        for scan in scans {
-            if hits().any(|(other, _)| other.sensor == scan.sensor) {
+        for (number, scan) in scans.iter().enumerate() {
+            let hit = hypothesis
+                .hits
+                .binary_search_by_key(&number, |(scan, _)| *scan);
+            if scan.is_trusted() && hit.is_ok() {
                 continue;
             }
             let Some(sensor) = self.sensors.get(scan.sensor) else {
@@ -647,9 +662,9 @@ impl InstantUpdate<'_> {
                 let nats = rates.nats(false);
                 log_odds += scan.trust * nats;
                 if let Some(history) = track.history.for_observation(scan.sensor, at) {
-                    history.miss(at, &rates);
+                    history.miss(at, nats);
                     if !scan.occlusion.hides(&position) {
-                        history.deny(&rates);
+                        history.deny(nats, rates.has_pose);
                     }
                 }
             }

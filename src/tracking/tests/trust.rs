@@ -71,7 +71,33 @@ fn observers_precede_vehicles_that_miss() {
         .count();
     assert!(with_slot < 100 && history.for_observation(ids[100], at(1)).is_none());
     assert!(history.for_hit(ids[100], at(1)).is_some());
-    assert!(history.has_room(ids[100], at(1)) && !history.has_room(ids[0], at(1)));
+    assert!(history.get(ids[100]).is_some() && history.get(ids[0]).is_none());
+    assert!(!history.has_room(at(1)));
+}
+
+#[test]
+fn silent_vehicle_loses_its_slot() {
+    let mut sensors = Sensors::new(ReputationConfig::default());
+    let mut id = |n: u32| {
+        sensors
+            .receive(&name(&format!("v{n}")), at(0), &TracksConfig::default())
+            .0
+            .id
+    };
+    let [silent, newcomer] = [0, 100].map(&mut id);
+    let others: Vec<SensorId> = (1..32).map(&mut id).collect();
+    let mut history = DetectionHistory::default();
+    for vehicle in [silent].iter().chain(&others) {
+        assert!(history.for_observation(*vehicle, at(0)).is_some());
+    }
+    for vehicle in &others {
+        let slot = history.for_observation(*vehicle, at(5));
+        slot.unwrap().miss(at(5), 0.0);
+    }
+    assert!(!history.has_room(at(10)) && history.has_room(at(11)));
+    assert!(history.for_observation(newcomer, at(11)).is_some());
+    assert!(history.get(silent).is_none() && !history.has_room(at(15)));
+    assert!(history.has_room(at(16)));
 }
 
 /// Four vehicles observe the place. One vehicle that otherwise agrees with them reports an object there with high
