@@ -56,7 +56,7 @@ pub(super) struct StatedAttributes {
 impl StatedAttributes {
     /// True if the last statement is recent at `at`.
     pub(super) fn is_recent(&self, at: Timestamp) -> bool {
-        at.since(self.stated_at) <= MAX_AGE
+        at <= self.stated_at + MAX_AGE
     }
 
     /// Adds a detection at `at`; `heading_rad` is its corrected heading, `trust` the vehicle's weight,
@@ -91,36 +91,61 @@ impl StatedAttributes {
     }
 }
 
-/// Sum of the vehicles' mean scores by label. A vehicle with few readings has less weight.
-pub(super) fn labels<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> LabelWeights {
-    let mut sum = LabelWeights::new();
-    for attributes in stated {
-        for (label, weight) in &attributes.labels {
+/// Attributes of one object by the statements of several vehicles.
+pub(super) struct CombinedAttributes {
+    /// Sum of the vehicles' mean scores by label. A vehicle with few readings has less weight.
+    pub(super) labels: LabelWeights,
+    pub(super) heading_rad: Option<f64>,
+    pub(super) size_m: Option<[f64; 2]>,
+}
+
+impl CombinedAttributes {
+    pub(super) fn of<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Self {
+        let mut labels = LabelWeights::new();
+        let mut headings = Headings::new();
+        let mut sizes: SmallVec<[[f64; 2]; 8]> = SmallVec::new();
+        for attributes in stated {
             let readings = attributes.readings + HALF_WEIGHT_READINGS;
-            add(&mut sum, label, weight / readings);
+            for (label, weight) in &attributes.labels {
+                let weight = weight / readings;
+                match labels.first_mut() {
+                    // Most vehicles state the same label.
+                    Some((first, sum)) if first == label => *sum += weight,
+                    _ => add(&mut labels, label, weight),
+                }
+            }
+            if let Some(heading_rad) = attributes.heading_rad {
+                headings.push((attributes.stated_at, heading_rad));
+            }
+            if let Some(size_m) = attributes.size_m {
+                sizes.push(size_m);
+            }
+        }
+        Self {
+            labels,
+            heading_rad: mean_heading_rad(headings),
+            size_m: median_size_m(&sizes),
         }
     }
-    sum
 }
+
+/// Headings and the times at which they were stated.
+type Headings = SmallVec<[(Timestamp, f64); 8]>;
 
 /// Mean of the stated headings that are near their median on the circle, the heading with the smallest
 /// sum of angles to the others; of several, the latest.
-pub(super) fn heading_rad<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Option<f64> {
-    let mut headings: SmallVec<[(Timestamp, f64); 8]> = stated
-        .filter_map(|attributes| Some((attributes.stated_at, attributes.heading_rad?)))
-        .collect();
+fn mean_heading_rad(mut headings: Headings) -> Option<f64> {
     headings.sort_by_key(|(stated_at, _)| Reverse(*stated_at));
-    let distance = |heading: &f64| -> f64 {
+    let distance = |heading: f64| -> f64 {
         let others = headings.iter();
         others
             .map(|(_, other)| wrap_angle(other - heading).abs())
             .sum()
     };
-    let by_distance = |a: &f64, b: &f64| distance(a).total_cmp(&distance(b));
-    let median = headings
+    let (_, median) = headings
         .iter()
-        .map(|(_, heading)| *heading)
-        .min_by(by_distance)?;
+        .map(|(_, heading)| (distance(*heading), *heading))
+        .min_by(|a, b| a.0.total_cmp(&b.0))?;
     let angles: SmallVec<[f64; 8]> = headings
         .iter()
         .map(|(_, heading)| wrap_angle(heading - median))
@@ -131,9 +156,7 @@ pub(super) fn heading_rad<'a>(stated: impl Iterator<Item = &'a StatedAttributes>
 }
 
 /// Median of the stated lengths and of the stated widths; of two, the smaller one.
-pub(super) fn size_m<'a>(stated: impl Iterator<Item = &'a StatedAttributes>) -> Option<[f64; 2]> {
-    let sizes: SmallVec<[[f64; 2]; 8]> =
-        stated.filter_map(|attributes| attributes.size_m).collect();
+fn median_size_m(sizes: &[[f64; 2]]) -> Option<[f64; 2]> {
     let middle = sizes.len().checked_sub(1)? / 2;
     Some([0, 1].map(|side| {
         let mut values: SmallVec<[f64; 8]> = sizes.iter().map(|size| size[side]).collect();

@@ -23,9 +23,19 @@ pub(super) struct Gauge {
 
 impl Gauge {
     /// Puts two observers into one group.
+    #[inline]
     pub(super) fn join(&mut self, one: SensorId, other: SensorId) {
-        let one = self.group(one.number());
-        let other = self.group(other.number());
+        let [one, other] = [one, other].map(SensorId::number);
+        let towards = [self.towards.get(one), self.towards.get(other)];
+        // Most pairs correspond in every report; only the first time needs a search.
+        if !matches!(towards, [Some(one), Some(other)] if one == other) {
+            self.unite(one, other);
+        }
+    }
+
+    fn unite(&mut self, one: usize, other: usize) {
+        let one = self.group(one);
+        let other = self.group(other);
         self.towards[one] = other;
     }
 
@@ -161,12 +171,6 @@ impl Consensus {
             }
             sums.motion()
         };
-        let residuals = |motion: &Motion| -> Vec<f64> {
-            members
-                .iter()
-                .map(|member| prior.deviations(&(error(member) - motion.at(&member.pivot))))
-                .collect()
-        };
         let trusted = members.iter().filter(|member| member.trust > 0.0).count();
         if trusted < Self::MIN_MEMBERS {
             let weights: Vec<f64> = members.iter().map(|member| member.weight).collect();
@@ -176,27 +180,27 @@ impl Consensus {
             });
         }
         let mut weights: Vec<f64> = members.iter().map(|member| member.trust).collect();
-        let mut from_fit = Vec::new();
+        let mut residuals = vec![0.0; members.len()];
+        let mut sorted = Vec::with_capacity(members.len());
         let mut median = 0.0;
         for _ in 0..Self::ITERATIONS {
-            from_fit = residuals(&fit(&weights)?);
-            median = weighted_median(members, &from_fit).max(Self::MIN_MEDIAN);
-            weights = from_fit
-                .iter()
-                .zip(members)
-                .map(|(residual, member)| member.trust * (median / residual).min(1.0))
-                .collect();
+            let motion = fit(&weights)?;
+            for (residual, member) in residuals.iter_mut().zip(members) {
+                *residual = prior.deviations(&(error(member) - motion.at(&member.pivot)));
+            }
+            median = weighted_median(members, &residuals, &mut sorted).max(Self::MIN_MEDIAN);
+            for ((weight, residual), member) in weights.iter_mut().zip(&residuals).zip(members) {
+                *weight = member.trust * (median / residual).min(1.0);
+            }
         }
         let scale = Self::OUTLYING * deviation(median, trusted);
-        let consistencies: Vec<f64> = from_fit
+        let consistencies: Vec<f64> = residuals
             .iter()
             .map(|residual| (-(residual / scale).powi(2)).exp())
             .collect();
-        let weights: Vec<f64> = consistencies
-            .iter()
-            .zip(members)
-            .map(|(consistency, member)| consistency * member.weight)
-            .collect();
+        for ((weight, consistency), member) in weights.iter_mut().zip(&consistencies).zip(members) {
+            *weight = consistency * member.weight;
+        }
         Some(Self {
             motion: fit(&weights)?,
             consistencies,
@@ -274,13 +278,15 @@ impl MotionSums {
     }
 }
 
-/// Median of the residuals, weighted by the trust in the members.
-fn weighted_median(members: &[GroupMember], residuals: &[f64]) -> f64 {
-    let mut sorted: Vec<(f64, f64)> = residuals
-        .iter()
-        .zip(members)
-        .map(|(residual, member)| (*residual, member.trust))
-        .collect();
+/// Median of the residuals, weighted by the trust in the members; `sorted` is a buffer.
+fn weighted_median(
+    members: &[GroupMember],
+    residuals: &[f64],
+    sorted: &mut Vec<(f64, f64)>,
+) -> f64 {
+    sorted.clear();
+    let trusts = members.iter().map(|member| member.trust);
+    sorted.extend(residuals.iter().copied().zip(trusts));
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
     let half = sorted.iter().map(|(_, weight)| weight).sum::<f64>() / 2.0;
     let mut below = 0.0;

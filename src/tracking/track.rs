@@ -6,7 +6,7 @@ use std::time::Duration;
 use nalgebra::Vector2;
 use uuid::Uuid;
 
-use super::attributes::{self, LabelWeights};
+use super::attributes::{self, CombinedAttributes, LabelWeights};
 use super::class::ObjectClass;
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
@@ -149,13 +149,12 @@ impl Track {
 
     /// Derives label, heading and size from the recent statements of all vehicles.
     pub(super) fn combine_attributes(&mut self, at: Timestamp) {
-        let stated = || {
-            let statements = self.history.iter().map(|history| &history.attributes);
-            statements.filter(|attributes| attributes.is_recent(at))
-        };
-        let mut labels = attributes::labels(stated());
-        let heading_rad = attributes::heading_rad(stated());
-        let size_m = attributes::size_m(stated());
+        let stated = self.history.iter().map(|history| &history.attributes);
+        let CombinedAttributes {
+            mut labels,
+            heading_rad,
+            size_m,
+        } = CombinedAttributes::of(stated.filter(|attributes| attributes.is_recent(at)));
         for (label, weight) in &mut self.inherited_labels {
             attributes::add(&mut labels, label, *weight);
             *weight *= attributes::KEPT;
@@ -247,9 +246,10 @@ impl Track {
 
     /// Records whether any vehicle detects the object at `at`.
     pub(super) fn record_detected(&mut self, at: Timestamp) {
-        self.is_detected = self.history.iter().any(|history| {
-            history.state.is_hit() && at.since(history.observed_at) <= DETECTED_WITHIN
-        });
+        self.is_detected = self
+            .history
+            .iter()
+            .any(|history| history.state.is_hit() && at <= history.observed_at + DETECTED_WITHIN);
     }
 
     /// Probability that the object is there at `at`, from observations and confidences; `trust` returns the trust in a
