@@ -97,8 +97,8 @@ fn solve<C: Candidate>(
     limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,
     assigned: &mut Vec<C>,
 ) {
-    let mut row_of = HashMap::new();
-    let mut column_of = HashMap::new();
+    let mut row_of = HashMap::with_capacity(cluster.len());
+    let mut column_of = HashMap::with_capacity(cluster.len());
     let mut cells: Vec<(usize, usize)> = Vec::with_capacity(cluster.len());
     for candidate in cluster {
         let next_row = row_of.len();

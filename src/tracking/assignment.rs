@@ -20,6 +20,7 @@ use smallvec::SmallVec;
 
 use super::config::TracksConfig;
 use super::existence::{DetectionRates, ObservationState};
+use super::grid::square;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::inverse;
 use super::scan::{Scan, ScannedDetection};
@@ -72,6 +73,8 @@ pub(super) struct Hypothesis {
     information: Information,
     /// Position and covariance of `information`, metres; `None` without any.
     estimate: Option<(Vector2<f64>, Matrix2<f64>)>,
+    /// Probability that the object exists.
+    existence: f64,
     /// Numbers of scans and their detections, by scan.
     pub(super) hits: SmallVec<[(usize, usize); 4]>,
 }
@@ -109,12 +112,13 @@ impl Information {
 }
 
 impl Hypothesis {
-    fn new(track: Option<TrackIndex>, prior: Information) -> Self {
+    fn new(track: Option<TrackIndex>, prior: Information, existence: f64) -> Self {
         Self {
             track,
             prior,
             information: prior,
             estimate: prior.mean(),
+            existence,
             hits: SmallVec::new(),
         }
     }
@@ -141,6 +145,35 @@ struct GatedPair {
     benefit: f64,
 }
 
+/// One scan in the passes of an assignment.
+struct AssignedScan<'a> {
+    scan: &'a Scan<'a>,
+    /// Information of each detection.
+    information: Vec<Information>,
+    /// Hypotheses of the tracks near the detections, one detection after the other; empty before the first pass.
+    near: Vec<usize>,
+    /// By detection, the end of its hypotheses in `near`.
+    near_ends: Vec<usize>,
+    /// Hypothesis of each detection by the latest pass; empty before the first pass.
+    owners: Vec<usize>,
+}
+
+impl<'a> AssignedScan<'a> {
+    fn new(scan: &'a Scan<'a>) -> Self {
+        let information = |detection: &ScannedDetection<'_>| {
+            let measurement = &detection.measurement;
+            Information::of(&measurement.position, &measurement.independent)
+        };
+        Self {
+            scan,
+            information: scan.detections.iter().map(information).collect(),
+            near: Vec::new(),
+            near_ends: Vec::new(),
+            owners: Vec::new(),
+        }
+    }
+}
+
 /// Association of one instant.
 pub(super) struct Assignment<'a> {
     config: &'a TracksConfig,
@@ -162,76 +195,74 @@ impl<'a> Assignment<'a> {
         at: Timestamp,
         config: &'a TracksConfig,
     ) -> Vec<Hypothesis> {
+        let detections = scans.iter().map(|scan| scan.detections.len()).sum();
         let mut assignment = Self {
             config,
             tracks,
             sensors,
             at,
-            hypotheses: Vec::new(),
-            of_track: HashMap::new(),
+            hypotheses: Vec::with_capacity(detections),
+            of_track: HashMap::with_capacity(detections),
             new: HashMap::new(),
         };
-        let mut owners: Vec<Vec<usize>> = vec![Vec::new(); scans.len()];
+        let mut assigned: Vec<AssignedScan<'_>> = scans.iter().map(AssignedScan::new).collect();
         let passes = if scans.len() > 1 { PASSES } else { 1 };
         for _ in 0..passes {
-            for (scan, owners) in scans.iter().zip(&mut owners) {
-                assignment.assign(scan, owners);
+            for scan in &mut assigned {
+                assignment.assign(scan);
             }
         }
-        for (number, owners) in owners.iter().enumerate() {
-            for (detection, owner) in owners.iter().enumerate() {
+        for (number, scan) in assigned.iter().enumerate() {
+            for (detection, owner) in scan.owners.iter().enumerate() {
                 assignment.hypotheses[*owner].hits.push((number, detection));
             }
         }
         assignment.hypotheses
     }
 
-    /// Assigns one scan. `owners` holds the hypothesis of each detection: before the call by the previous pass, after it by
-    /// this pass.
-    fn assign(&mut self, scan: &Scan<'_>, owners: &mut Vec<usize>) {
-        let information: Vec<Information> = scan
-            .detections
-            .iter()
-            .map(|detection| {
-                let measurement = &detection.measurement;
-                Information::of(&measurement.position, &measurement.independent)
-            })
-            .collect();
-        if scan.is_trusted() {
-            for (owner, information) in owners.iter().zip(&information) {
-                self.hypotheses[*owner].add(information, -1.0);
-            }
+    /// Assigns one scan, anew after an earlier pass.
+    fn assign(&mut self, assigned: &mut AssignedScan<'_>) {
+        let scan = assigned.scan;
+        self.add_information(assigned, -1.0);
+        if assigned.near_ends.is_empty() {
+            self.find_near_tracks(assigned);
         }
-        let pairs = self.gated_pairs(scan);
-        let mut assigned: Vec<Option<usize>> = vec![None; scan.detections.len()];
+        let pairs = self.gated_pairs(assigned);
+        let mut owners: Vec<Option<usize>> = vec![None; scan.detections.len()];
         for pair in assign(pairs, greedy_if_large) {
-            assigned[pair.detection] = Some(pair.hypothesis);
+            owners[pair.detection] = Some(pair.hypothesis);
         }
-        self.assign_fast(scan, &mut assigned);
-        *owners = assigned
+        self.assign_fast(scan, &mut owners);
+        assigned.owners = owners
             .iter()
             .zip(&scan.detections)
             .map(|(owner, detection)| owner.unwrap_or_else(|| self.open(scan, detection)))
             .collect();
-        if scan.is_trusted() {
-            for (owner, information) in owners.iter().zip(&information) {
-                self.hypotheses[*owner].add(information, 1.0);
+        self.add_information(assigned, 1.0);
+    }
+
+    /// Adds the information of a scan's detections to its hypotheses, or removes it if `sign` is -1.
+    fn add_information(&mut self, assigned: &AssignedScan<'_>, sign: f64) {
+        if assigned.scan.is_trusted() {
+            for (owner, information) in assigned.owners.iter().zip(&assigned.information) {
+                self.hypotheses[*owner].add(information, sign);
             }
         }
     }
 
     /// Assigns remaining detections that are likely objects to unconfirmed tracks, whose velocity is unknown.
     fn assign_fast(&mut self, scan: &Scan<'_>, assigned: &mut [Option<usize>]) {
+        let detections = scan.detections.iter().enumerate();
+        let likely = detections.filter(|(number, detection)| {
+            assigned[*number].is_none() && detection.confidence_nats > 0.0
+        });
+        let likely: SmallVec<[_; 4]> = likely.take(MAX_FAST).collect();
+        if likely.is_empty() {
+            return;
+        }
         let taken: HashSet<usize> = assigned.iter().flatten().copied().collect();
         let mut pairs = Vec::new();
-        let likely = scan
-            .detections
-            .iter()
-            .enumerate()
-            .filter(|(number, detection)| {
-                assigned[*number].is_none() && detection.confidence_nats > 0.0
-            });
-        for (number, detection) in likely.take(MAX_FAST) {
+        for (number, detection) in likely {
             let reach_m = detection.class.max_speed_mps * FAST_WITHIN.as_secs_f64();
             let near = self.nearest_tracks(
                 &detection.measurement.position,
@@ -239,7 +270,7 @@ impl<'a> Assignment<'a> {
                 MAX_TRACKS_NEAR,
                 |track| self.tracks[track].may_have_any_velocity(),
             );
-            for track in near {
+            for (_, track) in near {
                 let hypothesis = self.of_track(track);
                 if !taken.contains(&hypothesis)
                     && let Some(benefit) = self.benefit_if_fast(&self.tracks[track], detection)
@@ -280,37 +311,50 @@ impl<'a> Assignment<'a> {
         let next = self.hypotheses.len();
         let hypothesis = *self.of_track.entry(track).or_insert(next);
         if hypothesis == next {
-            let state = &self.tracks[track].state;
+            let Track {
+                state, existence, ..
+            } = &self.tracks[track];
             let prior = Information::of(&state.position_at(self.at), &state.covariance_at(self.at));
-            self.hypotheses.push(Hypothesis::new(Some(track), prior));
+            self.hypotheses
+                .push(Hypothesis::new(Some(track), prior, existence.probability()));
         }
         hypothesis
     }
 
-    /// All pairs of a detection and a hypothesis that explain the detection better than clutter.
-    /// The vehicle's own track is excluded; of many near tracks only the nearest are compared.
-    fn gated_pairs(&mut self, scan: &Scan<'_>) -> Vec<GatedPair> {
+    /// Finds the tracks near each detection. The vehicle's own track is excluded; of many near tracks only the nearest
+    /// are compared.
+    fn find_near_tracks(&mut self, assigned: &mut AssignedScan<'_>) {
+        let scan = assigned.scan;
         let reach_m = self.config.gate_m + self.tracks.slack_m(self.at);
         let max_near = max_tracks_near(scan.detections.len());
         let own_track = self.tracks.of_vehicle(scan.sensor);
-        let mut pairs = Vec::with_capacity(2 * scan.detections.len());
-        for (number, detection) in scan.detections.iter().enumerate() {
+        for detection in &scan.detections {
             let position = &detection.measurement.position;
             let tracks = self.nearest_tracks(position, reach_m, max_near, |track| {
                 Some(track) != own_track
             });
-            let mut near: SmallVec<[usize; 16]> = tracks
-                .into_iter()
-                .map(|track| self.of_track(track))
-                .collect();
-            self.new_near(position, &mut near);
-            let Some(sensor) = self.sensors.get(scan.sensor).filter(|_| !near.is_empty()) else {
-                continue;
-            };
+            let hypotheses = tracks.into_iter().map(|(_, track)| self.of_track(track));
+            assigned.near.extend(hypotheses);
+            assigned.near_ends.push(assigned.near.len());
+        }
+    }
+
+    /// All pairs of a detection and a hypothesis that explain the detection better than clutter.
+    fn gated_pairs(&self, assigned: &AssignedScan<'_>) -> Vec<GatedPair> {
+        let detections = &assigned.scan.detections;
+        let mut pairs = Vec::with_capacity(2 * detections.len());
+        let Some(sensor) = self.sensors.get(assigned.scan.sensor) else {
+            return pairs;
+        };
+        let mut start = 0;
+        for (number, (detection, end)) in detections.iter().zip(&assigned.near_ends).enumerate() {
+            let near = &assigned.near[start..*end];
+            start = *end;
             let rates = sensor.coverage.rates_at(&detection.reported);
-            for hypothesis in near {
+            let new = self.new_near(&detection.measurement.position);
+            for hypothesis in near.iter().copied().chain(new) {
                 let benefit =
-                    self.benefit(scan.sensor, rates, detection, &self.hypotheses[hypothesis]);
+                    self.benefit(sensor.id, rates, detection, &self.hypotheses[hypothesis]);
                 pairs.extend(benefit.map(|benefit| GatedPair {
                     detection: number,
                     hypothesis,
@@ -321,15 +365,15 @@ impl<'a> Assignment<'a> {
         pairs
     }
 
-    /// Tracks within `reach_m` of a position for which `is_candidate` holds: of more than `max`, the
-    /// nearest.
+    /// Tracks within `reach_m` of a position for which `is_candidate` holds, with their distances: of more than `max`,
+    /// the nearest.
     fn nearest_tracks(
         &self,
         position: &Vector2<f64>,
         reach_m: f64,
         max: usize,
         is_candidate: impl Fn(TrackIndex) -> bool,
-    ) -> SmallVec<[TrackIndex; 16]> {
+    ) -> SmallVec<[(f64, TrackIndex); 16]> {
         let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
         self.tracks.near(position, reach_m, |indexed| {
             if is_candidate(indexed.track) {
@@ -344,7 +388,7 @@ impl<'a> Assignment<'a> {
             tracks.truncate(max);
             tracks.sort_unstable_by(by_distance);
         }
-        tracks.into_iter().map(|(_, track)| track).collect()
+        tracks
     }
 
     /// Log-likelihood ratio of a pair, greater than 0; `None` if clutter or a new object explains the detection better.
@@ -369,16 +413,14 @@ impl<'a> Assignment<'a> {
             return None;
         }
         let rate = |state| rates.map_or(UNKNOWN_RATE, |rates| rates.rate(state));
-        let (detected, similarity) = match hypothesis.track.map(|track| &self.tracks[track]) {
-            Some(track) => {
-                let state = track.history.state_of(sensor);
-                (
-                    track.existence.probability() * rate(state),
-                    track.label_similarity(detection.object),
-                )
-            }
-            None => (NEW_EXISTENCE * rate(ObservationState::First), 1.0),
+        let (state, similarity) = match hypothesis.track.map(|track| &self.tracks[track]) {
+            Some(track) => (
+                track.history.state_of(sensor),
+                track.label_similarity(detection.object),
+            ),
+            None => (ObservationState::First, 1.0),
         };
+        let detected = hypothesis.existence * rate(state);
         let odds = detected.max(MIN_DETECTED) / (1.0 - detected);
         let new_per_m2 = detection.class.new_per_m2;
         let density = TAU * covariance.determinant().sqrt() * new_per_m2;
@@ -388,32 +430,27 @@ impl<'a> Assignment<'a> {
 
     /// A new hypothesis at a detection. Other vehicles may join it if it has information.
     fn open(&mut self, scan: &Scan<'_>, detection: &ScannedDetection<'_>) -> usize {
-        let square = self.square(&detection.measurement.position);
+        let square = square(&detection.measurement.position, self.config.gate_m);
         let number = self.hypotheses.len();
         self.hypotheses
-            .push(Hypothesis::new(None, Information::NONE));
+            .push(Hypothesis::new(None, Information::NONE, NEW_EXISTENCE));
         if scan.is_trusted() {
             self.new.entry(square).or_default().push(number);
         }
         number
     }
 
-    fn square(&self, position: &Vector2<f64>) -> (i64, i64) {
-        let line = |coordinate_m: f64| (coordinate_m / self.config.gate_m).floor() as i64;
-        (line(position.x), line(position.y))
-    }
-
-    /// Adds the numbers of the instant's new hypotheses in the squares around a position.
-    fn new_near(&self, position: &Vector2<f64>, near: &mut SmallVec<[usize; 16]>) {
-        if self.new.is_empty() {
-            return;
-        }
-        let (column, row) = self.square(position);
-        for (dx, dy) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy))) {
-            if let Some(numbers) = self.new.get(&(column + dx, row + dy)) {
-                near.extend(numbers.iter().copied().take(MAX_NEW_NEAR));
-            }
-        }
+    /// The instant's new hypotheses in the squares around a position.
+    fn new_near(&self, position: &Vector2<f64>) -> impl Iterator<Item = usize> {
+        let (column, row) = square(position, self.config.gate_m);
+        let squares = (column - 1..=column + 1)
+            .flat_map(move |column| (row - 1..=row + 1).map(move |row| (column, row)));
+        let squares = (!self.new.is_empty()).then_some(squares);
+        let numbers = squares
+            .into_iter()
+            .flatten()
+            .filter_map(|square| self.new.get(&square));
+        numbers.flat_map(|numbers| numbers.iter().copied().take(MAX_NEW_NEAR))
     }
 }
 

@@ -202,7 +202,7 @@ impl TrackGrid {
 }
 
 /// Column and row of the square with a side of `side_m` that contains a position.
-fn square(position: &Vector2<f64>, side_m: f64) -> (i64, i64) {
+pub(super) fn square(position: &Vector2<f64>, side_m: f64) -> (i64, i64) {
     (floor(position.x / side_m), floor(position.y / side_m))
 }
 
