@@ -29,7 +29,7 @@ use misreading::PlacedReport;
 
 pub use misreading::{Misreading, MistakenHeading};
 
-use crate::model::names::NodeName;
+use crate::model::names::{NodeName, vehicle_of};
 use crate::model::time::Timestamp;
 use crate::wire::ObjectReport;
 
@@ -122,25 +122,26 @@ impl OrientationCheck {
 
     /// Compares a report with the simultaneous reports of the nearest other vehicles.
     fn compare(&mut self, report: &ObjectReport, at: Timestamp) {
-        let vehicle = report.node.vehicle();
+        let vehicle = vehicle_of(report.node.as_str());
         let distance_m = |other: &ObjectReport| {
             let poses = report.pose.zip(other.pose);
             poses.map_or(f64::INFINITY, |(own, other)| {
                 (own.x_m - other.x_m).hypot(own.y_m - other.y_m)
             })
         };
-        let mut simultaneous: Vec<&ObjectReport> = self
+        let mut simultaneous: Vec<(f64, &ObjectReport)> = self
             .observers
             .iter()
             .filter(|(name, other)| {
                 let apart_us = other.captured_at.micros_from(at).unsigned_abs();
-                apart_us <= SIMULTANEOUS.as_micros() as u64 && name.vehicle() != vehicle
+                apart_us <= SIMULTANEOUS.as_micros() as u64 && vehicle_of(name.as_str()) != vehicle
             })
             .map(|(_, other)| &*other.latest)
             .filter(|other| !other.objects.is_empty())
+            .map(|other| (distance_m(other), other))
             .collect();
-        simultaneous.sort_by(|one, other| distance_m(one).total_cmp(&distance_m(other)));
-        let others = witnesses(simultaneous);
+        simultaneous.sort_by(|one, other| one.0.total_cmp(&other.0));
+        let others = witnesses(simultaneous.into_iter().map(|(_, other)| other));
         let is_due = at.since(self.judged_at) >= JUDGEMENT_INTERVAL;
         let Some(observer) = self
             .observers
@@ -162,11 +163,11 @@ impl OrientationCheck {
 }
 
 /// The first reports of the first vehicles. A vehicle is one witness, however many parts it has.
-fn witnesses(reports: Vec<&ObjectReport>) -> Vec<PlacedReport> {
-    let mut vehicles: Vec<(NodeName, usize)> = Vec::new();
+fn witnesses<'a>(reports: impl Iterator<Item = &'a ObjectReport>) -> Vec<PlacedReport> {
+    let mut vehicles: Vec<(&str, usize)> = Vec::new();
     let mut placed = Vec::new();
     for report in reports {
-        let vehicle = report.node.vehicle();
+        let vehicle = vehicle_of(report.node.as_str());
         let known = vehicles.iter().position(|(name, _)| *name == vehicle);
         let number = match known {
             Some(number) => number,

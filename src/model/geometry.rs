@@ -60,7 +60,17 @@ impl Pose {
 
 /// The same angle in (-π, π].
 pub fn wrap_angle(angle_rad: f64) -> f64 {
-    let wrapped = angle_rad.rem_euclid(TAU);
+    // Most angles are less than a turn; the remainder of these is the angle itself, and a slow division without this test.
+    let remainder = if angle_rad.abs() < TAU {
+        angle_rad
+    } else {
+        angle_rad % TAU
+    };
+    let wrapped = if remainder < 0.0 {
+        remainder + TAU
+    } else {
+        remainder
+    };
     if wrapped > PI { wrapped - TAU } else { wrapped }
 }
 

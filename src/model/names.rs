@@ -82,8 +82,10 @@ impl NodeName {
 
 /// As [`NodeName::vehicle`], for a text that may be another kind of name, such as an address.
 pub fn vehicle_of(name: &str) -> &str {
-    match name.split_once(PART_MARK) {
-        Some((vehicle, _)) if !vehicle.is_empty() => vehicle,
+    // Names are short, and the search for a text would prepare tables for a long one.
+    let mut pairs = name.as_bytes().windows(PART_MARK.len());
+    match pairs.position(|pair| pair == PART_MARK.as_bytes()) {
+        Some(end) if end > 0 => name.get(..end).unwrap_or(name),
         _ => name,
     }
 }

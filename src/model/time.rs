@@ -38,8 +38,8 @@ impl Timestamp {
 
     /// Signed microseconds from `other` to this.
     pub fn micros_from(self, other: Self) -> i64 {
-        let difference = i128::from(self.0) - i128::from(other.0);
-        difference.clamp(i128::from(i64::MIN), i128::from(i64::MAX)) as i64
+        let limit = if self < other { i64::MIN } else { i64::MAX };
+        self.0.checked_signed_diff(other.0).unwrap_or(limit)
     }
 
     /// This point moved by signed microseconds, stopping at the ends of the range.
