@@ -169,7 +169,8 @@ impl Pace {
     pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
         let (landmarks, gate_m) = self.places();
         let point = Point2::new(object.x_m, object.y_m);
-        object.landmark.is_some() || landmarks.within(&point, gate_m).next().is_some()
+        let is_near = || landmarks.within(&point, gate_m).next().is_some();
+        object.landmark.is_some() || !landmarks.landmarks().is_empty() && is_near()
     }
 
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock.

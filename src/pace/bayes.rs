@@ -150,6 +150,9 @@ impl BayesPace {
     /// Every place that the vehicle had in view, ascending: places with a detection and places
     /// listed as `seen`.
     fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
+        if self.landmarks.landmarks().is_empty() {
+            return Vec::new();
+        }
         let mut observations = self.associate(&report.objects);
         let observation_of = |landmark| Observation {
             place: Place::object(landmark),
