@@ -176,8 +176,8 @@ impl RoundFilter {
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
 
-    /// Accepts or refuses reputations. They are a state, so their age does not matter: after a stall, one that waited in
-    /// a queue may precede one of many rounds later. Maps and verdicts show that these rounds were published.
+    /// Accepts or refuses reputations. They are a state, so their age does not matter: after a stall, reputations from
+    /// a queue may precede the reputations of many rounds later. Maps and verdicts show that these rounds were published.
     ///
     /// # Errors
     /// Returns the reason for the refusal.
@@ -373,7 +373,7 @@ mod tests {
         );
     }
 
-    /// A node stands still for 11 s. The reputations that waited and those of the current round arrive together.
+    /// A node stands still for 11 s. Queued reputations and the reputations of the current round arrive together.
     #[test]
     fn reputations_follow_queued_ones() {
         let mut filter = RoundFilter::new(0, ms(0));
@@ -405,7 +405,7 @@ mod tests {
         let resumed = at(120);
         let waited = take(&mut filter, &map(8, 11, at(11)), resumed, &leadership);
         assert_eq!(waited, Err(Refusal::Stale));
-        assert_eq!(accept(&mut filter, 11, resumed), Ok(()), "it waited, too");
+        assert_eq!(accept(&mut filter, 11, resumed), Ok(()), "queued, too");
         assert_eq!(accept(&mut filter, 119, resumed), Ok(()));
         let now = at(121);
         let next = accept(&mut filter, 90_000, now);
