@@ -395,7 +395,7 @@ mod tests {
             )
             .unwrap();
         }
-        let mut accept = |filter: &mut RoundFilter, round, now| {
+        let accept = |filter: &mut RoundFilter, round, now| {
             let accepted =
                 filter.accept_reputations(&reputations(round), Origin::Claimed, now, &leadership);
             accepted.map(|_| ())
