@@ -11,13 +11,11 @@ use ecod::admission::minimum_delay::MinimumDelay;
 use ecod::model::time::Timestamp;
 use serde::{Deserialize, Serialize};
 
-/// Least delay from the stated capture to arrival up to which stamps are plausible: a clock that is
-/// further behind is wrong.
-const MAX_DELAY: Duration = Duration::from_secs(1);
+/// Least delay from the stated capture to arrival, in microseconds, up to which stamps are plausible:
+/// a clock that is further behind is wrong.
+const MAX_DELAY_US: i64 = 1_000_000;
 
-const MAX_DELAY_US: i64 = MAX_DELAY.as_micros() as i64;
-
-/// Time for which frames may arrive later than [`MAX_DELAY`] as a burst after a stall. If they are
+/// Time for which frames may arrive later than [`MAX_DELAY_US`] as a burst after a stall. If they are
 /// late for longer, the clock of the source has stood still.
 const MAX_BURST: Duration = Duration::from_secs(2);
 
@@ -66,7 +64,7 @@ pub(super) struct CaptureClock {
     delay: MinimumDelay,
     /// The latest stamp.
     last_stamp: Option<Timestamp>,
-    /// Start of the present run of frames that are later than [`MAX_DELAY`], by arrival.
+    /// Start of the present run of frames that are later than [`MAX_DELAY_US`], by arrival.
     late_since: Option<Timestamp>,
     /// True once two frames had one stamp: the clock is too coarse to date frames.
     is_coarse: bool,
