@@ -194,7 +194,7 @@ impl SourceConfig {
     }
 
     /// Configured seconds from capture to arrival; `None` for recordings.
-    fn latency_s(&self) -> Option<f64> {
+    pub(crate) fn latency_s(&self) -> Option<f64> {
         match self {
             Self::V4l2 { latency_s, .. }
             | Self::Gstreamer { latency_s, .. }

@@ -601,6 +601,42 @@ mod tests {
         }
     }
 
+    #[cfg(feature = "camera")]
+    #[test]
+    fn latency_of_stale_reports_is_refused() {
+        let detector = "detector.kind = \"placard\"\n";
+        let first = format!(
+            "[camera]\n{detector}source = {{ kind = \"v4l2\", latency_s = 0.35 }}\n\
+             [[cameras]]\nname = \"rear\"\n{detector}source = {{ kind = \"v4l2\", latency_s = "
+        );
+        for (latency_s, max_age_s, is_late) in [
+            ("0.9", "1.0", false),
+            ("1.0", "1.0", true),
+            ("1.5", "1.0", true),
+            ("1.5", "2.0", false),
+            ("0.3", "0.3", true),
+        ] {
+            let loaded = load(&format!(
+                "{first}{latency_s} }}\n[fusion.window]\nmax_age_s = {max_age_s}"
+            ));
+            let error = loaded.err().map(|error| error.to_string());
+            assert_eq!(
+                error.is_some(),
+                is_late,
+                "{latency_s} {max_age_s} {error:?}"
+            );
+        }
+        let error = load(&format!("{first}2 }}")).unwrap_err().to_string();
+        for part in [
+            "`cameras[0].source.latency_s`",
+            ": 2 is",
+            "below `fusion.window.max_age_s`, 1:",
+            "raise that key",
+        ] {
+            assert!(error.contains(part), "{error}");
+        }
+    }
+
     #[test]
     fn incomplete_configuration_stops_start() {
         let written =

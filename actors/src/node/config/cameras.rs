@@ -32,11 +32,12 @@ impl NodeConfig {
         }
     }
 
-    /// Checks that cameras have distinct names.
+    /// Checks each camera, its latency, and that cameras have distinct names.
     #[cfg(feature = "camera")]
     pub(super) fn validate_cameras(&self) -> Result<(), ConfigError> {
         if let Some(camera) = &self.camera {
-            camera.validate().map_err(|error| error.within("camera"))?;
+            self.validate_camera(camera)
+                .map_err(|error| error.within("camera"))?;
         }
         if self.cameras.len() > MAX_PARTS {
             return Err(ConfigError::new(
@@ -47,7 +48,7 @@ impl NodeConfig {
         }
         for (index, camera) in self.cameras.iter().enumerate() {
             let within = |error: ConfigError| error.within(&format!("cameras[{index}]"));
-            camera.validate().map_err(within)?;
+            self.validate_camera(camera).map_err(within)?;
             let earlier = self.camera.iter().chain(self.cameras.iter().take(index));
             let Some(name) = camera
                 .name
@@ -74,6 +75,22 @@ impl NodeConfig {
             }
         }
         Ok(())
+    }
+
+    /// Checks a camera, and that aggregators do not refuse all of its reports as stale.
+    #[cfg(feature = "camera")]
+    fn validate_camera(&self, camera: &CameraConfig) -> Result<(), ConfigError> {
+        camera.validate()?;
+        let max_age_s = self.fusion.window.max_age_s;
+        match camera.source.latency_s() {
+            Some(latency_s) if latency_s >= max_age_s => {
+                let allowed = format!(
+                    "below `fusion.window.max_age_s`, {max_age_s}: every report would be stale; use a faster stream, or raise that key on all nodes of the cell"
+                );
+                Err(ConfigError::new("source.latency_s", latency_s, allowed))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// All cameras of the vehicle.
