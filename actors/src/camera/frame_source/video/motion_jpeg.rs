@@ -2,19 +2,20 @@
 //! one part for each picture (`multipart/x-mixed-replace`).
 //!
 //! FFmpeg reads such streams, too, but hides the time of capture in a part's header, `X-Timestamp`.
-//! Whatever this reader does not support is left to FFmpeg: `https://`, redirects, other
-//! authentication than Basic, parts without a length.
+//! Whatever this reader does not support is left to FFmpeg ([`Unsupported`]): `https://`, redirects,
+//! other authentication than Basic, other content, parts without a length. FFmpeg would fail at other
+//! errors as well, and name no reason.
 
 use std::time::Duration;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use axum::body::{Body, BodyDataStream};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use bytes::BytesMut;
 use ecod::model::time::Timestamp;
 use futures_util::StreamExt;
-use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, WWW_AUTHENTICATE};
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, HOST, HeaderValue, USER_AGENT, WWW_AUTHENTICATE};
 use hyper::{Request, Response, StatusCode, Uri};
 use hyper_util::rt::TokioIo;
 use percent_encoding::percent_decode_str;
@@ -32,6 +33,14 @@ const MAX_HEADER: usize = 16 << 10;
 
 /// Maximum length of a picture in bytes.
 const MAX_PICTURE: usize = 32 << 20;
+
+/// Name of this program in requests: some cameras refuse requests without one.
+const AGENT: &str = concat!("ecod/", env!("CARGO_PKG_VERSION"));
+
+/// An answer in a form that this reader does not support.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct Unsupported(String);
 
 /// An open stream.
 pub(super) struct MotionJpeg {
@@ -75,11 +84,11 @@ impl MotionJpeg {
         });
         let (parts, first) = match opened {
             Ok(Ok(opened)) => opened,
-            Ok(Err(error)) => {
+            Ok(Err(error)) if error.is::<Unsupported>() => {
                 eprintln!("left to FFmpeg: {error:#}");
-                runtime.shutdown_background();
                 return Ok(None);
             }
+            Ok(Err(error)) => return Err(failed(format!("{error:#}"))),
             Err(_) => {
                 // Does not wait for a name that is still being resolved.
                 runtime.shutdown_background();
@@ -163,13 +172,26 @@ impl Address {
     async fn open(&self) -> anyhow::Result<PartReader> {
         let mut response = self.request(None).await?;
         if response.status() == StatusCode::UNAUTHORIZED {
+            let login = self.login.as_deref().with_context(|| {
+                format!(
+                    "{}: the address has no user and password",
+                    response.status()
+                )
+            })?;
             let challenge = response.headers().get(WWW_AUTHENTICATE);
-            let scheme = challenge.and_then(|challenge| challenge.as_bytes().get(..5));
-            let is_basic = scheme.is_some_and(|scheme| scheme.eq_ignore_ascii_case(b"basic"));
-            let login = self.login.as_deref().filter(|_| is_basic);
-            response = self.request(Some(login.context("no Basic login")?)).await?;
+            ensure!(
+                challenge.is_none_or(is_basic),
+                Unsupported(format!("authentication by {challenge:?}"))
+            );
+            response = self.request(Some(login)).await?;
         }
-        ensure!(response.status() == StatusCode::OK, "{}", response.status());
+        let status = response.status();
+        ensure!(
+            status != StatusCode::UNAUTHORIZED,
+            "{status}: the camera refuses user or password"
+        );
+        ensure!(!status.is_redirection(), Unsupported(status.to_string()));
+        ensure!(status == StatusCode::OK, "{status}");
         let content = response.headers().get(CONTENT_TYPE);
         let content = content.and_then(|content| content.to_str().ok());
         ensure!(
@@ -178,7 +200,7 @@ impl Address {
                     .to_ascii_lowercase()
                     .starts_with("multipart/x-mixed-replace")
             }),
-            "content {content:?}"
+            Unsupported(format!("content {content:?}"))
         );
         Ok(PartReader {
             body: response.into_body().into_data_stream(),
@@ -197,14 +219,29 @@ impl Address {
             let _ = connection.await;
         });
         let path = self.uri.path_and_query().map_or("/", |path| path.as_str());
-        let mut request = Request::get(path).header(HOST, format!("{host}:{port}"));
+        let mut request = Request::get(path)
+            .header(HOST, format!("{host}:{port}"))
+            .header(USER_AGENT, AGENT);
         if let Some(login) = login {
             let encoded = BASE64_STANDARD.encode(login);
             request = request.header(AUTHORIZATION, format!("Basic {encoded}"));
         }
-        let response = sender.send_request(request.body(Body::empty())?).await?;
+        let sent = sender.send_request(request.body(Body::empty())?).await;
+        let response = sent.map_err(|error| {
+            if error.is_parse() {
+                anyhow!(Unsupported(error.to_string()))
+            } else {
+                error.into()
+            }
+        })?;
         Ok(response.map(Body::new))
     }
+}
+
+/// True if a challenge is for Basic authentication.
+fn is_basic(challenge: &HeaderValue) -> bool {
+    let scheme = challenge.as_bytes().get(..5);
+    scheme.is_some_and(|scheme| scheme.eq_ignore_ascii_case(b"basic"))
 }
 
 /// One picture of the stream.
@@ -233,7 +270,8 @@ impl PartReader {
             if line.is_empty() {
                 break;
             }
-            let (name, value) = line.split_once(':').context("no header of a part")?;
+            let header = line.split_once(':');
+            let (name, value) = header.ok_or_else(|| Unsupported("no header of a part".into()))?;
             match name.to_ascii_lowercase().as_str() {
                 "content-length" => length = value.trim().parse().ok(),
                 "x-timestamp" => stamp = time_of_camera(value.trim()),
@@ -241,8 +279,11 @@ impl PartReader {
             }
         }
         let arrived_at = clock::now();
-        let length = length.context("no length of a part")?;
-        ensure!(length <= MAX_PICTURE, "a picture of {length} bytes");
+        let length = length.ok_or_else(|| Unsupported("no length of a part".into()))?;
+        ensure!(
+            length <= MAX_PICTURE,
+            Unsupported(format!("a picture of {length} bytes"))
+        );
         while self.buffer.len() < length {
             self.receive().await?;
         }
@@ -258,7 +299,10 @@ impl PartReader {
         loop {
             let end = self.buffer.iter().position(|byte| *byte == b'\n');
             let bytes = end.map_or(self.buffer.len(), |end| end + 1);
-            ensure!(bytes <= *room, "the header of a part is too long");
+            ensure!(
+                bytes <= *room,
+                Unsupported("the header of a part is too long".into())
+            );
             if end.is_some() {
                 *room -= bytes;
                 let line = self.buffer.split_to(bytes);
@@ -283,3 +327,6 @@ fn time_of_camera(seconds: &str) -> Option<FrameStamp> {
     let wall = Timestamp::default() + since_1970;
     Some(FrameStamp::Time(wall.shifted(-clock::wall_offset_us())))
 }
+
+#[cfg(test)]
+mod tests;
