@@ -8,8 +8,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use moq_v4l::buffer::{self, Metadata};
+use moq_v4l::device::Handle;
 use moq_v4l::io::mmap::Stream;
-use moq_v4l::io::traits::CaptureStream;
+use moq_v4l::io::traits::{self, CaptureStream};
 use moq_v4l::video::Capture;
 use moq_v4l::video::capture::Parameters;
 use moq_v4l::{Device, Format, FourCC, Fraction};
@@ -32,7 +33,8 @@ const BUFFERS: u32 = 3;
 /// A camera that takes pictures.
 pub(super) struct V4l2Camera {
     origin: String,
-    stream: Stream<'static>,
+    /// Present until the camera is dropped.
+    stream: Option<Stream<'static>>,
     is_streaming: bool,
     layout: FrameLayout,
     timeout: Duration,
@@ -106,7 +108,7 @@ impl V4l2Camera {
         stream.set_timeout(timeout);
         Ok(Self {
             origin,
-            stream,
+            stream: Some(stream),
             is_streaming: false,
             layout,
             timeout,
@@ -114,36 +116,28 @@ impl V4l2Camera {
             seq: 0,
         })
     }
+}
 
-    fn lost(&self, error: &io::Error) -> FrameError {
-        FrameError::Lost {
-            origin: self.origin.clone(),
-            reason: error.to_string(),
-        }
-    }
-
-    /// Waits until a buffer is filled, or the camera is gone.
-    fn wait(&self) -> Result<(), FrameError> {
-        let device = self.stream.handle();
-        let timeout_ms = i32::try_from(self.timeout.as_millis()).unwrap_or(i32::MAX);
-        loop {
-            match device.poll(PollFlags::IN.bits() as i16, timeout_ms) {
-                Ok(0) => return Err(FrameError::Stalled(self.timeout)),
-                Ok(_) => return Ok(()),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(self.lost(&error)),
-            }
+impl Drop for V4l2Camera {
+    fn drop(&mut self) {
+        if let Some(stream) = self.stream.take() {
+            release(stream, &self.origin);
         }
     }
 }
 
 impl FrameSource for V4l2Camera {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
-        if std::mem::replace(&mut self.is_streaming, true) {
-            self.wait()?;
-        }
-        // Starts the camera, or returns the buffer of the frame before to the driver.
-        let (pixels, metadata) = match CaptureStream::next(&mut self.stream) {
+        let is_streaming = std::mem::replace(&mut self.is_streaming, true);
+        let stream = self.stream.as_mut().ok_or(io::ErrorKind::NotConnected);
+        let filled = stream.map_err(io::Error::from).and_then(|stream| {
+            if is_streaming {
+                wait(&stream.handle(), self.timeout)?;
+            }
+            // Starts the camera, or returns the buffer of the frame before to the driver.
+            CaptureStream::next(stream)
+        });
+        let (pixels, metadata) = match filled {
             Ok(filled) => filled,
             Err(error) if error.kind() == io::ErrorKind::TimedOut => {
                 return Err(FrameError::Stalled(self.timeout));
@@ -178,6 +172,32 @@ impl FrameSource for V4l2Camera {
 
     fn time_source(&self) -> TimeSource {
         self.clock.source()
+    }
+}
+
+/// Waits until a buffer is filled, or the camera is gone.
+fn wait(device: &Handle, timeout: Duration) -> io::Result<()> {
+    let timeout_ms = i32::try_from(timeout.as_millis()).unwrap_or(i32::MAX);
+    loop {
+        match device.poll(PollFlags::IN.bits() as i16, timeout_ms) {
+            Ok(0) => return Err(io::ErrorKind::TimedOut.into()),
+            Ok(_) => return Ok(()),
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+/// Stops and drops a stream of a camera. If the driver refuses to stop, the stream is leaked and its
+/// buffers stay reserved: its drop would panic, then its buffers' drop during this panic, which ends
+/// the process.
+fn release(mut stream: impl traits::Stream, camera: &str) {
+    match stream.stop() {
+        Err(error) if error.raw_os_error() != Some(Errno::NODEV.raw_os_error()) => {
+            tracing::warn!(camera, %error, "the camera does not stop: unplug it, or restart the node");
+            std::mem::forget(stream);
+        }
+        _ => drop(stream),
     }
 }
 

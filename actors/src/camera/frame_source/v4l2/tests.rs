@@ -1,3 +1,5 @@
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use moq_v4l::Timestamp;
 use moq_v4l::buffer::Flags;
 
@@ -42,5 +44,50 @@ fn implausible_stamp_is_refused() {
             ..metadata
         };
         assert_eq!(age(&metadata, now), None, "{timestamp}");
+    }
+}
+
+/// A stream of the library whose driver answers a stop by this error.
+struct StoppingStream<'a> {
+    error: Option<Errno>,
+    is_dropped: &'a AtomicBool,
+}
+
+impl traits::Stream for StoppingStream<'_> {
+    type Item = [u8];
+
+    fn start(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn stop(&mut self) -> io::Result<()> {
+        self.error.map_or(Ok(()), |error| Err(error.into()))
+    }
+}
+
+impl Drop for StoppingStream<'_> {
+    fn drop(&mut self) {
+        self.is_dropped.store(true, Ordering::Relaxed);
+        let error = self.error.filter(|error| *error != Errno::NODEV);
+        assert_eq!(error, None, "the library panics");
+    }
+}
+
+#[test]
+fn refused_stop_ends_no_process() {
+    for (error, expected) in [
+        (None, true),
+        (Some(Errno::NODEV), true),
+        (Some(Errno::BUSY), false),
+    ] {
+        let is_dropped = AtomicBool::default();
+        release(
+            StoppingStream {
+                error,
+                is_dropped: &is_dropped,
+            },
+            "/dev/video0",
+        );
+        assert_eq!(is_dropped.load(Ordering::Relaxed), expected, "{error:?}");
     }
 }
