@@ -71,6 +71,8 @@ trouble_kinds! {
     ClockOff = "clock_off", SHORT, "run a time service on it, such as chrony";
     /// The camera delivers no frames.
     Camera = "camera", UNTIL_SETTLED, "`ecod-node doctor` tries the camera and names what is missing";
+    /// The camera stamps its frames by a wrong clock.
+    CameraClock = "camera_clock", SHORT, "set the camera's clock by NTP, or state the delay of its frames in `camera.source.latency_s`";
     /// The detector takes longer for a frame than reports are accepted.
     DetectorSlow = "detector_slow", UNTIL_SETTLED, "use smaller frames, another model or a faster machine";
     /// The pose of the camera is unavailable, so the detections in its frames cannot be placed.

@@ -22,6 +22,7 @@ use tokio::time::timeout;
 
 use crate::camera::detect::{Detect, DetectError};
 use crate::camera::frame::CameraFrame;
+use crate::camera::frame_source::TimeSource;
 use crate::camera::frame_source::capture::{
     Capture, CaptureConfig, CaptureStatus, Opener, Readers,
 };
@@ -103,6 +104,11 @@ const SLOW_FRAMES: u32 = 3;
 /// Duration of one frame from which a detector is reported as slow before the frame is done.
 const SLOW_AFTER: Duration = Duration::from_secs(5);
 const SLOW_DETECTOR: &str = "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
+
+/// Successive frames with wrong stamps, from which the camera's clock is reported as wrong: the first
+/// frames of a stream may be old.
+const WRONG_STAMPS: u32 = 10;
+const WRONG_CLOCK: &str = "the camera states capture times after the arrival of its frames or more than 1 s before it: they count as captured on arrival";
 
 /// Maximum time for the camera to end.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -291,6 +297,7 @@ async fn pump(
     let mut skipped = 0;
     let mut unusable = 0;
     let mut failures = 0;
+    let mut wrong_stamps = 0;
     loop {
         let mut ready = pin!(Arc::clone(&permits).acquire_owned());
         let permit = loop {
@@ -333,6 +340,13 @@ async fn pump(
             );
             return;
         };
+        wrong_stamps = match capture.time_source() {
+            Some(TimeSource::WrongStamp) => wrong_stamps + 1,
+            _ => 0,
+        };
+        if wrong_stamps >= WRONG_STAMPS {
+            troubles.record(TroubleKind::CameraClock, WRONG_CLOCK);
+        }
         let span = spans.borrow().frame(frame.captured_at);
         if span.in_scope(|| {
             detector
@@ -351,9 +365,30 @@ mod tests {
 
     use ecod::model::names::NodeName;
     use ecod::perception::camera::Intrinsics;
+    use opencv::core::{CV_8UC3, Mat, Scalar};
 
     use super::*;
     use crate::camera::config::CameraConfig;
+    use crate::camera::frame_source::{FrameError, FrameSource};
+    use crate::platform::clock;
+
+    /// A camera whose clock is wrong.
+    struct WrongClock;
+
+    impl FrameSource for WrongClock {
+        fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
+            std::thread::sleep(Duration::from_millis(10));
+            Ok(CameraFrame {
+                image: Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(0.0)).unwrap(),
+                captured_at: clock::now(),
+                seq: 0,
+            })
+        }
+
+        fn time_source(&self) -> TimeSource {
+            TimeSource::WrongStamp
+        }
+    }
 
     /// A model that is too large for its machine: each frame takes until the test releases it.
     struct Slow(Receiver<()>);
@@ -431,6 +466,32 @@ mod tests {
         timeout(Duration::from_secs(60), until(false))
             .await
             .unwrap();
+        detector.stop(None);
+        ended.await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn wrong_camera_clock_is_trouble() {
+        let counters = Arc::<Counters>::default();
+        let arguments = DetectorArguments {
+            open: Arc::new(|| Ok(Box::new(WrongClock))),
+            ..arguments(Steady(Arc::default()), &counters)
+        };
+        let (detector, ended) = Actor::spawn(None, Detector, arguments).await.unwrap();
+        let reported = async {
+            loop {
+                if let Some(trouble) = counters.troubles().present().pop() {
+                    return trouble;
+                }
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        let trouble = timeout(Duration::from_secs(60), reported).await.unwrap();
+        assert_eq!(
+            (&*trouble.kind, &*trouble.cause),
+            ("camera_clock", WRONG_CLOCK)
+        );
+        assert!(trouble.remedy.contains("`camera.source.latency_s`"));
         detector.stop(None);
         ended.await.unwrap();
     }

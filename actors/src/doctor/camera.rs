@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
 use ecod::model::time::Timestamp;
 
 use super::Finding;
 use crate::camera::config::CameraConfig;
 use crate::camera::frame::CameraFrame;
-use crate::camera::frame_source::SourceConfig;
+use crate::camera::frame_source::{SourceConfig, TimeSource};
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
@@ -68,7 +69,12 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
             if !camera.masks.is_empty() {
                 seen += &format!(", masks: {}", camera.masks.len());
             }
-            (Finding::fine(check, seen), Some(frame))
+            let finding = if time_source == TimeSource::WrongStamp {
+                Finding::doubtful(check, seen, TroubleKind::CameraClock.remedy())
+            } else {
+                Finding::fine(check, seen)
+            };
+            (finding, Some(frame))
         }
         Ok(Ok(Err(error))) => (Finding::broken(check, error.to_string(), fix), None),
         Ok(Err(_)) | Err(_) => (

@@ -119,6 +119,6 @@ fn wrong_driver_clock_gives_spacing() {
         ("FAKE_CAMERA_FLAGS", MONOTONIC_SOE),
         ("FAKE_CAMERA_AHEAD_US", "-60000000"),
     ]);
-    assert_eq!(observed.time_source, TimeSource::Position.to_string());
+    assert_eq!(observed.time_source, TimeSource::WrongStamp.to_string());
     assert!(observed.late_us < 500_000, "{} us", observed.late_us);
 }

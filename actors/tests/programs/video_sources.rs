@@ -465,7 +465,7 @@ fn header_of_picture_gives_time() {
 fn wrong_camera_clock_spaces_pictures() {
     let slow = |at: Timestamp| format!("X-Timestamp: {}\r\n", at - Duration::from_secs(3600));
     let (errors, time_source) = errors_of_stated_times(slow);
-    assert_eq!(time_source, TimeSource::Position);
+    assert_eq!(time_source, TimeSource::WrongStamp);
     let spread = errors[20] - errors[2];
     assert!(spread < 20.0, "{errors:?}");
 }

@@ -19,7 +19,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
-use super::{FrameError, FrameSource};
+use super::{FrameError, FrameSource, TimeSource};
 use crate::camera::frame::CameraFrame;
 use crate::platform::latest_slot::LatestSlot;
 
@@ -93,6 +93,7 @@ pub type Opener = Arc<dyn Fn() -> Result<Box<dyn FrameSource>, FrameError> + Sen
 pub struct Capture {
     slot: Arc<LatestSlot<CameraFrame>>,
     status: watch::Receiver<CaptureStatus>,
+    time_source: watch::Receiver<Option<TimeSource>>,
     events: SyncSender<CaptureEvent>,
     unusable: Arc<AtomicU64>,
     failures: Arc<AtomicU64>,
@@ -107,12 +108,14 @@ impl Capture {
     pub fn start(open: Opener, config: CaptureConfig) -> std::io::Result<Self> {
         let slot = Arc::new(LatestSlot::default());
         let (status_sender, status) = watch::channel(CaptureStatus::default());
+        let (time_source_sender, time_source) = watch::channel(None);
         let (events, inbox) = mpsc::sync_channel(1);
         let capture = CaptureLoop {
             open,
             config,
             slot: Arc::clone(&slot),
             status: status_sender,
+            time_source: time_source_sender,
             events: events.clone(),
             inbox,
             opening: Arc::default(),
@@ -131,6 +134,7 @@ impl Capture {
         Ok(Self {
             slot,
             status,
+            time_source,
             events,
             unusable,
             failures,
@@ -152,6 +156,11 @@ impl Capture {
     /// Number of frames of a recording that are not images.
     pub fn unusable(&self) -> u64 {
         self.unusable.load(Ordering::Relaxed)
+    }
+
+    /// How the capture time of the latest frame was determined; `None` before the first frame.
+    pub fn time_source(&self) -> Option<TimeSource> {
+        *self.time_source.borrow()
     }
 
     /// Number of failures and stalls.
@@ -238,6 +247,7 @@ struct CaptureLoop {
     config: CaptureConfig,
     slot: Arc<LatestSlot<CameraFrame>>,
     status: watch::Sender<CaptureStatus>,
+    time_source: watch::Sender<Option<TimeSource>>,
     events: SyncSender<CaptureEvent>,
     inbox: Receiver<CaptureEvent>,
     /// Number of the current opening and its reader.
@@ -299,6 +309,7 @@ impl CaptureLoop {
             opening,
             current: Arc::clone(&self.opening),
             events: self.events.clone(),
+            time_source: self.time_source.clone(),
         };
         let open = Arc::clone(&self.open);
         let running = ReaderGuard::new(self.readers.clone());
@@ -381,6 +392,7 @@ struct Reader {
     opening: u64,
     current: Arc<AtomicU64>,
     events: SyncSender<CaptureEvent>,
+    time_source: watch::Sender<Option<TimeSource>>,
 }
 
 impl Reader {
@@ -389,19 +401,25 @@ impl Reader {
             Ok(source) => source,
             Err(error) => return self.send(Err(error)),
         };
-        let mut time_source = None;
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
-            let present = read.is_ok().then(|| source.time_source());
-            if let Some(present) = present.filter(|present| time_source != Some(*present)) {
-                tracing::info!(by = %present, "frames are dated");
-                time_source = Some(present);
+            if read.is_ok() {
+                self.record_time_source(source.time_source());
             }
             let failed = read.as_ref().is_err_and(|error| !error.is_passing());
             self.send(read);
             if failed {
                 return;
             }
+        }
+    }
+
+    fn record_time_source(&self, present: TimeSource) {
+        let is_new = self
+            .time_source
+            .send_if_modified(|last| last.replace(present) != Some(present));
+        if is_new {
+            tracing::info!(by = %present, "frames are dated");
         }
     }
 

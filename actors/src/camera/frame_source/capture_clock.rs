@@ -37,6 +37,8 @@ pub enum TimeSource {
     Stamp,
     /// Arrival, freed from jitter by the positions in the stream.
     Position,
+    /// Arrival, freed from jitter by stamps of a clock that is ahead or more than a second behind.
+    WrongStamp,
     /// Arrival.
     Arrival,
 }
@@ -47,6 +49,7 @@ impl fmt::Display for TimeSource {
             Self::Playback => "playback",
             Self::Stamp => "capture stamps",
             Self::Position => "arrival and stream positions",
+            Self::WrongStamp => "arrival and the spacing of wrong capture stamps",
             Self::Arrival => "arrival",
         })
     }
@@ -131,7 +134,11 @@ impl CaptureClock {
             self.source = TimeSource::Stamp;
             stated
         } else {
-            self.source = TimeSource::Position;
+            self.source = if is_time {
+                TimeSource::WrongStamp
+            } else {
+                TimeSource::Position
+            };
             stated.shifted(self.delay.least()) - latency
         }
     }

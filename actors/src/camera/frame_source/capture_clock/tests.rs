@@ -55,7 +55,7 @@ fn wrong_camera_clock_gives_spacing_only() {
             let stated = frame.captured_at.shifted((wrong_s * 1e6) as i64);
             let time = clock.time(Some(FrameStamp::Time(stated)), frame.arrived_at);
             assert_eq!(time, frame.captured_at + ms(30), "{wrong_s}");
-            assert_eq!(clock.source(), TimeSource::Position);
+            assert_eq!(clock.source(), TimeSource::WrongStamp);
         }
     }
 }
