@@ -44,6 +44,10 @@ const UNSEEN_HZ: f64 = 0.15;
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 
+/// Minimum time between two detections by one vehicle that both count in [`SensorHistory::max_sole_nats`]: a faster
+/// camera sees the cause of a false detection no more often.
+const COUNTED_INTERVAL: Duration = Duration::from_millis(75);
+
 /// Minimum number of observations before a vehicle's statement is judged.
 const MIN_JUDGED_OBSERVATIONS: u32 = 5;
 
@@ -224,9 +228,12 @@ pub(super) struct SensorHistory {
     sequence: f64,
     /// Evidence of all misses without occlusion before the first detection, nats.
     absence: f64,
-    /// Fading sums of the evidence of confidences, nats, and of the number of detections.
+    /// Fading sums of the evidence of confidences, nats, and of their number.
     score: f64,
     weight: f64,
+    /// Fading number of detections, at most one in [`COUNTED_INTERVAL`], and time of the last of them.
+    detections: f64,
+    counted_at: Option<Timestamp>,
 }
 
 /// Hits and observations of one object by one vehicle over some time.
@@ -256,6 +263,8 @@ impl SensorHistory {
             absence: 0.0,
             score: 0.0,
             weight: 0.0,
+            detections: 0.0,
+            counted_at: None,
         }
     }
 
@@ -270,6 +279,13 @@ impl SensorHistory {
         self.observe(at, nats);
         self.score += confidence_nats;
         self.weight += 1.0;
+        if self
+            .counted_at
+            .is_none_or(|last| at.since(last) >= COUNTED_INTERVAL)
+        {
+            self.counted_at = Some(at);
+            self.detections += 1.0;
+        }
         self.unjudged.hits += 1;
         self.unjudged.observations += 1;
         self.state = self.state.after(true);
@@ -303,6 +319,7 @@ impl SensorHistory {
         let kept = (-at.since(self.observed_at).as_secs_f64() / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
+        self.detections *= kept;
         self.sequence = (self.sequence * kept + nats).clamp(-MAX_PEER_NATS, MAX_PEER_NATS);
         self.observed_at = self.observed_at.max(at);
         self.observations = self.observations.saturating_add(1);
@@ -346,7 +363,7 @@ impl SensorHistory {
     /// unknown probability; if all probabilities are equally likely, n false detections in a row have the probability
     /// 1/(n+1) (Laplace's rule of succession).
     pub(super) fn max_sole_nats(&self) -> f64 {
-        self.weight.ln_1p()
+        self.detections.ln_1p()
     }
 
     fn confidence_nats(&self, at: Timestamp) -> f64 {

@@ -269,14 +269,15 @@ impl Track {
         let Some(denied) = self.denied_nats(at, &trust) else {
             return logistic(observations + confidences);
         };
-        // Without a detection, the object comes from another aggregator's map.
-        let limit = self
-            .history
-            .iter()
-            .filter(|history| history.last_hit.is_some())
-            .map(|history| trust(history.sensor) * history.max_sole_nats())
-            .reduce(f64::max)
-            .unwrap_or(f64::INFINITY);
+        // An object of another aggregator's map has evidence of that aggregator.
+        let limit = if self.spawned_by.is_some() {
+            self.history
+                .iter()
+                .map(|history| trust(history.sensor) * history.max_sole_nats())
+                .fold(0.0, f64::max)
+        } else {
+            f64::INFINITY
+        };
         let sole = observations.min(limit) + confidences;
         if denied < 0.0 {
             logistic(sole.min(MAX_DENIED_NATS) + denied)

@@ -139,3 +139,54 @@ fn rare_detections_are_no_denial() {
     let (published, counts) = scene.published();
     assert!(published > 0.95, "{published}, {counts:?}");
 }
+
+#[test]
+fn frame_rate_adds_no_sole_evidence() {
+    let existence = |interval_us: u64| {
+        let mut tracker = tracker();
+        let object = PerceivedObject::new("car", 0.3, 20.0, 0.0);
+        let frames = 5_000_000 / interval_us;
+        for frame in 0..frames {
+            let captured_at = Timestamp(START.0 + frame * interval_us);
+            let report = ObjectReport {
+                captured_at_us: captured_at,
+                ..report("euclid", frame, vec![object.clone()])
+            };
+            tracker.observe(report, captured_at);
+            tracker.close(captured_at);
+        }
+        let end = Timestamp(START.0 + frames * interval_us);
+        tracker.close(end).objects[0].existence.unwrap()
+    };
+    let [slow, fast] = [100_000, 20_000].map(existence);
+    assert!(slow > 0.9 && fast < slow + 0.015, "{slow} {fast}");
+}
+
+/// Another aggregator had more evidence than the first detections of one vehicle.
+#[test]
+fn detection_keeps_inherited_existence() {
+    let mut newcomer = tracker();
+    let known = FusedObject {
+        existence: Some(0.95),
+        ..FusedObject::new(
+            Uuid::from_u128(7),
+            "car",
+            0.9,
+            20.0,
+            0.0,
+            Covariance::isotropic(0.2),
+        )
+    };
+    let map = GlobalMap {
+        objects: vec![known],
+        ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(0))
+    };
+    newcomer.adopt_map(&map, at(0));
+    for frame in 1..4 {
+        newcomer.observe(report("euclid", frame, vec![car(20.0, 0.0)]), at(frame));
+        let round = newcomer.close(at(frame));
+        let object = &round.objects[0];
+        assert_eq!(object.id, Uuid::from_u128(7));
+        assert!(object.existence.unwrap() > 0.94, "{object:?}");
+    }
+}
