@@ -196,7 +196,7 @@ impl CameraConfig {
             .validate()
             .map_err(|error| error.within("optics"))?;
         self.masks.polygons()?;
-        if !self.masks.is_empty() && self.optics.takes_any_shape() {
+        if !self.masks.is_empty() && self.optics.has_any_shape() {
             let allowed = "the width of the picture on which `masks` were drawn: set both sizes or `optics.calibration`, because frames of another shape are refused";
             return Err(ConfigError::missing("optics.width_px", allowed));
         }
@@ -262,13 +262,13 @@ impl OpticsConfig {
             None => Intrinsics::with_square_pixels(width, height, horizontal_rad),
         };
         Ok(Lens {
-            is_any_shape: self.takes_any_shape() && self.vertical_fov_deg.is_none(),
+            is_any_shape: self.has_any_shape() && self.vertical_fov_deg.is_none(),
             ..Lens::ideal(intrinsics)
         })
     }
 
     /// True if these optics state no aspect ratio of frames.
-    fn takes_any_shape(&self) -> bool {
+    fn has_any_shape(&self) -> bool {
         self.calibration.is_none() && self.width_px.is_none() && self.height_px.is_none()
     }
 }

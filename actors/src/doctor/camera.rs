@@ -9,7 +9,7 @@ use ecod::model::time::Timestamp;
 use super::Finding;
 use crate::camera::config::CameraConfig;
 use crate::camera::frame::CameraFrame;
-use crate::camera::frame_source::{SourceConfig, TimeSource};
+use crate::camera::frame_source::{FrameError, SourceConfig, TimeSource};
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
@@ -35,6 +35,8 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     }
     findings
 }
+
+const SHAPE_FIX: &str = "set `camera.optics` to the size of the frames, or calibrate";
 
 async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
     let check = "camera";
@@ -62,8 +64,7 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
             let size = ImageSize::of(&frame.image);
             if let Some(Err(mismatch)) = lens.map(|lens| lens.of_frames(size)) {
                 let seen = format!("frames of {size}, but optics of {}", mismatch.optics);
-                let fix = "set `camera.optics` to the size of the frames, or calibrate";
-                return (Finding::broken(check, seen, fix), None);
+                return (Finding::broken(check, seen, SHAPE_FIX), None);
             }
             let mut seen = format!("frames of {size}, dated by {time_source}");
             if !camera.masks.is_empty() {
@@ -76,7 +77,13 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
             };
             (finding, Some(frame))
         }
-        Ok(Ok(Err(error))) => (Finding::broken(check, error.to_string(), fix), None),
+        Ok(Ok(Err(error))) => {
+            let fix = match &error {
+                FrameError::Unusable { .. } if !camera.masks.is_empty() => SHAPE_FIX,
+                _ => fix,
+            };
+            (Finding::broken(check, error.to_string(), fix), None)
+        }
         Ok(Err(_)) | Err(_) => (
             Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix),
             None,

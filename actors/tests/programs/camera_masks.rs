@@ -204,7 +204,7 @@ async fn assert_node_masks(camera: CameraConfig, directory: &Path) {
         );
         assert_eq!(labels(&shown), [OPEN], "{path}");
     }
-    tokio::time::sleep(Duration::from_secs(1)).await;
+    tokio::time::sleep(Duration::from_secs(5)).await;
     node.stop().await;
 
     let log = Log::read(&directory.join("euclid"));
@@ -291,14 +291,16 @@ fn try_shows_masked_pictures() {
         .stdin(Stdio::piped())
         .stderr(Stdio::piped());
     let mut running = started.spawn().unwrap();
-    let printed = BufReader::new(running.stderr.take().unwrap()).lines();
-    let page = printed.map_while(Result::ok).find_map(|line| {
+    let mut printed = BufReader::new(running.stderr.take().unwrap()).lines();
+    let page = printed.by_ref().map_while(Result::ok).find_map(|line| {
         let (_, address) = line.split_once("page: http://")?;
         address.split('/').next()?.parse().ok()
     });
     let shown = picture(page.unwrap(), "/api/camera");
     running.stdin.take();
-    running.wait().unwrap();
+    // A program whose standard error is full or closed would not end.
+    printed.for_each(drop);
+    assert!(running.wait().unwrap().success());
     assert_masked(
         &BASE64_STANDARD
             .decode(shown["jpeg"].as_str().unwrap())
