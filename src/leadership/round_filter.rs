@@ -176,8 +176,8 @@ impl RoundFilter {
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
 
-    /// Accepts or refuses reputations. They are a state, so their age does not matter: after a stall, reputations from
-    /// a queue may precede the reputations of many rounds later. Maps and verdicts show that these rounds were published.
+    /// Accepts or refuses reputations. They are a state that brokers retain, so their age does not matter, and many
+    /// rounds may be missing. Maps and verdicts show which rounds can have been published.
     ///
     /// # Errors
     /// Returns the reason for the refusal.
@@ -193,10 +193,12 @@ impl RoundFilter {
             reputations.aggregator.clone().unwrap_or(UNNAMED),
         );
         self.check_origin(&epoch, origin)?;
-        let rounds = [&self.maps, &self.verdicts];
-        let possible = rounds.map(|rounds| rounds.last_possible(&epoch, received_at));
-        if let Some(last) = possible.into_iter().flatten().max() {
-            self.reputations.on_published(&epoch, last);
+        let possible = [&self.maps, &self.verdicts]
+            .into_iter()
+            .filter_map(|rounds| rounds.last_possible(&epoch, received_at))
+            .max();
+        if possible.is_some_and(|last| reputations.round > last) {
+            return Err(Refusal::Implausible);
         }
         self.reputations
             .admit(&epoch, reputations.round, received_at, leadership)?;
@@ -412,6 +414,13 @@ mod tests {
         assert_eq!(next, Err(Refusal::Implausible));
         take(&mut filter, &map(8, 121, now), now, &leadership).unwrap();
         assert_eq!(accept(&mut filter, 121, now), Ok(()));
+        // A vehicle joins while the retained reputations are minutes old; its arrival changes them.
+        let mut filter = RoundFilter::new(0, ms(0));
+        assert_eq!(accept(&mut filter, 1, ms(0)), Ok(()));
+        take(&mut filter, &map(8, 1700, ms(50)), ms(50), &leadership).unwrap();
+        assert_eq!(accept(&mut filter, 1700, ms(300)), Ok(()));
+        let next = accept(&mut filter, 90_000, ms(1400));
+        assert_eq!(next, Err(Refusal::Implausible));
     }
 
     #[test]

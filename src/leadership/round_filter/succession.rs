@@ -33,7 +33,7 @@ fn max_rounds_in(time: Duration) -> u64 {
 pub struct SuccessionFilter {
     gate: EpochGate,
     /// True if the topic's last message is retained. In this case any term is accepted while there
-    /// is no leader, and the first message may have any age.
+    /// is no leader, and messages may have any age, so that rounds may be missing.
     is_retained: bool,
     /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
@@ -41,8 +41,6 @@ pub struct SuccessionFilter {
     fresh_at: Option<Timestamp>,
     /// `fresh_at` without the last admitted message, which may prove stale.
     earlier_fresh_at: Option<Timestamp>,
-    /// True if the only admitted message may have been retained, and be of any age.
-    newest_is_retained: bool,
     elected: Option<Elected>,
     /// Start of the current period in which messages of other nodes are admitted, or in which the
     /// elected leader's messages are not.
@@ -52,8 +50,6 @@ pub struct SuccessionFilter {
     overruled: Option<NodeName>,
     /// The publisher of a term that the election has not seen, while there is no leader.
     stranger: Option<Stranger>,
-    /// A leadership and the last round that it can have published, by the leader's messages on other topics.
-    published: Option<(Epoch, u64)>,
 }
 
 /// The leader that the election named last.
@@ -95,18 +91,15 @@ impl SuccessionFilter {
             newest_at: None,
             fresh_at: None,
             earlier_fresh_at: None,
-            newest_is_retained: false,
             elected: None,
             others_since: None,
             overruled: None,
             stranger: None,
-            published: None,
         }
     }
 
     /// Creates a filter for a topic whose last message is retained. While there is no leader it
-    /// accepts any term from `floor` on, and the second message may be many rounds later than the
-    /// first.
+    /// accepts any term from `floor` on, and a message may be many rounds later than the one before.
     pub fn of_retained(floor: u64) -> Self {
         Self {
             is_retained: true,
@@ -159,7 +152,8 @@ impl SuccessionFilter {
         self.fresh_at = self.earlier_fresh_at;
     }
 
-    /// The last round that `epoch` can have published by `received_at`, if its message was the last on this topic.
+    /// The last round that `epoch` can have published by `received_at`; `None` if the last message on this topic is of
+    /// another epoch.
     pub(super) fn last_possible(&self, epoch: &Epoch, received_at: Timestamp) -> Option<u64> {
         let (_, last) = self.gate.latest().filter(|(latest, _)| *latest == epoch)?;
         let fresh_at = self.fresh_at.unwrap_or(received_at);
@@ -167,22 +161,6 @@ impl SuccessionFilter {
             last.saturating_add(MAX_ROUNDS_AHEAD)
                 .saturating_add(max_rounds_in(received_at.since(fresh_at))),
         )
-    }
-
-    /// Processes that another topic shows that `epoch` can have published rounds up to `round`.
-    pub(super) fn on_published(&mut self, epoch: &Epoch, round: u64) {
-        self.published = Some((epoch.clone(), round));
-    }
-
-    /// True if `epoch` cannot have published this round yet.
-    fn is_implausible(&self, epoch: &Epoch, round: u64, received_at: Timestamp) -> bool {
-        let by_others = self
-            .published
-            .as_ref()
-            .filter(|(published, _)| published == epoch)
-            .map_or(0, |(_, last)| *last);
-        self.last_possible(epoch, received_at)
-            .is_some_and(|last| round > last.max(by_others))
     }
 
     /// True if an unconfirmed epoch must not be accepted yet.
@@ -313,11 +291,11 @@ impl SuccessionFilter {
         received_at: Timestamp,
         may_lead: bool,
     ) -> Result<(), Refusal> {
-        let is_first = self.gate.latest().is_none();
         let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
         let quiet = silence >= EPOCH_MEMORY;
         self.fresh_at.get_or_insert(received_at);
-        if !quiet && !self.newest_is_retained && self.is_implausible(epoch, round, received_at) {
+        let possible = self.last_possible(epoch, received_at);
+        if !quiet && !self.is_retained && possible.is_some_and(|last| round > last) {
             return Err(Refusal::Implausible);
         }
         let mut admitted = self.gate.admit(epoch, round);
@@ -331,7 +309,6 @@ impl SuccessionFilter {
         })?;
         self.newest_at = Some(received_at);
         self.earlier_fresh_at = self.fresh_at.replace(received_at);
-        self.newest_is_retained = is_first && self.is_retained;
         Ok(())
     }
 }
@@ -390,24 +367,18 @@ mod tests {
         assert_eq!(admit(92, quiet + credit), Ok(()));
     }
 
-    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival
-    /// changes them.
     #[test]
-    fn only_retained_message_may_be_older() {
+    fn only_retained_messages_may_be_older() {
         let elected = epoch(7, "edge");
         let leadership = led_by(elected.clone(), None);
-        let mut filter = SuccessionFilter::of_retained(0);
-        let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
-        assert_eq!(admit(1, 0), Ok(()));
-        assert_eq!(admit(1700, 300), Ok(()));
-        assert_eq!(admit(1710, 1300), Ok(()));
-        assert_eq!(admit(90_000, 1400), Err(Refusal::Implausible));
-        let mut filter = SuccessionFilter::new(0);
-        let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
-        assert_eq!(
-            [admit(1, 0), admit(1700, 300)],
-            [Ok(()), Err(Refusal::Implausible)]
-        );
+        for (mut filter, expected) in [
+            (SuccessionFilter::of_retained(0), Ok(())),
+            (SuccessionFilter::new(0), Err(Refusal::Implausible)),
+        ] {
+            assert_eq!(filter.admit(&elected, 1, at(0), &leadership), Ok(()));
+            let later = filter.admit(&elected, 1700, at(300), &leadership);
+            assert_eq!(later, expected);
+        }
     }
 
     #[test]
