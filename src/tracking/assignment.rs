@@ -270,7 +270,7 @@ impl<'a> Assignment<'a> {
                 MAX_TRACKS_NEAR,
                 |track| self.tracks[track].may_have_any_velocity(),
             );
-            for (_, track) in near {
+            for track in near {
                 let hypothesis = self.of_track(track);
                 if !taken.contains(&hypothesis)
                     && let Some(benefit) = self.benefit_if_fast(&self.tracks[track], detection)
@@ -333,7 +333,7 @@ impl<'a> Assignment<'a> {
             let tracks = self.nearest_tracks(position, reach_m, max_near, |track| {
                 Some(track) != own_track
             });
-            let hypotheses = tracks.into_iter().map(|(_, track)| self.of_track(track));
+            let hypotheses = tracks.into_iter().map(|track| self.of_track(track));
             assigned.near.extend(hypotheses);
             assigned.near_ends.push(assigned.near.len());
         }
@@ -365,15 +365,15 @@ impl<'a> Assignment<'a> {
         pairs
     }
 
-    /// Tracks within `reach_m` of a position for which `is_candidate` holds, with their distances: of more than `max`,
-    /// the nearest.
+    /// Tracks within `reach_m` of a position for which `is_candidate` holds: of more than `max`, the
+    /// nearest.
     fn nearest_tracks(
         &self,
         position: &Vector2<f64>,
         reach_m: f64,
         max: usize,
         is_candidate: impl Fn(TrackIndex) -> bool,
-    ) -> SmallVec<[(f64, TrackIndex); 16]> {
+    ) -> SmallVec<[TrackIndex; 16]> {
         let mut tracks: SmallVec<[(f64, TrackIndex); 16]> = SmallVec::new();
         self.tracks.near(position, reach_m, |indexed| {
             if is_candidate(indexed.track) {
@@ -388,7 +388,7 @@ impl<'a> Assignment<'a> {
             tracks.truncate(max);
             tracks.sort_unstable_by(by_distance);
         }
-        tracks
+        tracks.into_iter().map(|(_, track)| track).collect()
     }
 
     /// Log-likelihood ratio of a pair, greater than 0; `None` if clutter or a new object explains the detection better.

@@ -107,12 +107,7 @@ impl CombinedAttributes {
         for attributes in stated {
             let readings = attributes.readings + HALF_WEIGHT_READINGS;
             for (label, weight) in &attributes.labels {
-                let weight = weight / readings;
-                match labels.first_mut() {
-                    // Most vehicles state the same label.
-                    Some((first, sum)) if first == label => *sum += weight,
-                    _ => add(&mut labels, label, weight),
-                }
+                add(&mut labels, label, weight / readings);
             }
             if let Some(heading_rad) = attributes.heading_rad {
                 headings.push((attributes.stated_at, heading_rad));
