@@ -53,12 +53,18 @@ fn record(leader: &NodeHandle, vehicles: [(&str, bool); 2]) -> u64 {
         std::iter::repeat_n(evidence, 40)
     };
     let evidence = vehicles.into_iter().flat_map(votes).collect();
-    let round = 50
-        + leader
-            .newest_reputations()
-            .borrow()
-            .as_ref()
-            .map_or(0, |newest| newest.message.round);
+    let map = leader
+        .newest_map()
+        .borrow()
+        .clone()
+        .map_or(0, |map| map.map.round);
+    let published = leader
+        .newest_reputations()
+        .borrow()
+        .as_ref()
+        .map_or(0, |newest| newest.message.round);
+    // Followers refuse reputations of rounds that cannot have been published yet, and of repeated rounds.
+    let round = map.max(published) + 1;
     let record = ReputationKeeperMessage::Record {
         epoch: epoch.clone(),
         round,
