@@ -290,7 +290,8 @@ pub fn is_label(text: &str) -> bool {
 
 /// True if a text has no control characters.
 pub fn is_plain_text(text: &str) -> bool {
-    !text.chars().any(|c| c.is_control() || is_layout_control(c))
+    let is_printable_ascii = text.bytes().all(|byte| (b' '..=b'~').contains(&byte));
+    is_printable_ascii || !text.chars().any(|c| c.is_control() || is_layout_control(c))
 }
 
 /// A text that satisfies [`is_plain_text`], of at most `max_bytes` bytes: control characters become

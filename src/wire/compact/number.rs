@@ -1,6 +1,5 @@
 //! Written forms of numbers.
 
-use minicbor::data::Type;
 use minicbor::decode::{self, Decoder};
 use minicbor::encode::{self, Encoder, Write};
 
@@ -22,6 +21,9 @@ pub(crate) struct CovarianceForm;
 
 /// Largest number of millimetres that is written as an integer; all positions are below.
 const MAX_MILLIMETRES: f64 = (1u64 << 53) as f64;
+
+/// The major type of floats, in the upper three bits of a number's first byte.
+const MAJOR_FLOAT: u8 = 7;
 
 /// Magnitudes of normal half-precision numbers.
 const HALF: std::ops::RangeInclusive<f64> = 6.103_515_625e-5..=65_504.0;
@@ -172,9 +174,11 @@ fn write_single<W: Write>(
 
 /// Reads an integer or a float of any width.
 fn read(d: &mut Decoder<'_>) -> Result<f64, decode::Error> {
-    match d.datatype()? {
-        Type::F16 | Type::F32 | Type::F64 => d.f64(),
-        _ => d.i64().map(|integer| integer as f64),
+    let first = d.input().get(d.position());
+    if first.is_some_and(|first| first >> 5 == MAJOR_FLOAT) {
+        d.f64()
+    } else {
+        d.i64().map(|integer| integer as f64)
     }
 }
 
