@@ -31,7 +31,10 @@ impl Births {
 /// The time for which the objects stay whose tracks one vehicle began.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Population {
+    /// Number of objects that left and whose tracks are gone.
     departures: f64,
+    /// Expected number of objects that have left, and whose tracks still exist.
+    absent: f64,
     /// Seconds for which objects stayed.
     stayed_s: f64,
 }
@@ -58,6 +61,7 @@ impl Population {
         for population in of_vehicles.filter(|population| population.stayed_s > 0.0) {
             vehicles += 1;
             sum.departures += population.departures;
+            sum.absent += population.absent;
             sum.stayed_s += population.stayed_s;
             let is_highest = highest.is_none_or(|highest| population.rate() > highest.rate());
             if is_highest {
@@ -66,6 +70,7 @@ impl Population {
         }
         if let Some(highest) = highest.filter(|_| vehicles > 1) {
             sum.departures -= highest.departures;
+            sum.absent -= highest.absent;
             sum.stayed_s -= highest.stayed_s;
         }
         sum.rate()
@@ -74,24 +79,59 @@ impl Population {
     fn usual() -> Self {
         Self {
             departures: Self::USUAL_TIME_S / Self::USUAL_STAY_S,
+            absent: 0.0,
             stayed_s: Self::USUAL_TIME_S,
         }
     }
 
     fn rate(&self) -> f64 {
-        self.departures / self.stayed_s
+        (self.departures + self.absent) / self.stayed_s
     }
 
-    /// Counts seconds for which objects stayed, summed over objects.
-    pub(super) fn stay(&mut self, seconds: f64) {
-        self.stayed_s += seconds;
+    /// Starts to count the objects of a round.
+    pub(super) fn begin_round(&mut self) {
+        self.absent = 0.0;
+    }
+
+    /// Counts an object with a track that is present with a probability, for the seconds of a round.
+    pub(super) fn count(&mut self, present: f64, seconds: f64) {
+        self.absent += 1.0 - present;
+        self.stayed_s += present * seconds;
         let kept = (Self::MAX_TIME_S / self.stayed_s).min(1.0);
         self.stayed_s *= kept;
         self.departures *= kept;
     }
 
-    /// Counts an object that left.
+    /// Counts an object that left and whose track is gone.
     pub(super) fn leave(&mut self) {
         self.departures += 1.0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn absent_objects_count_as_departures() {
+        let mut population = Population::default();
+        let rate = |population: &Population| Population::leaving_hz(std::iter::once(population));
+        for _ in 0..100 {
+            population.begin_round();
+            for _ in 0..10 {
+                population.count(1.0, 0.1);
+            }
+        }
+        let staying = rate(&population);
+        population.begin_round();
+        for present in [1.0, 1.0, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1] {
+            population.count(present, 0.1);
+        }
+        assert!(rate(&population) > 2.0 * staying, "{staying}");
+        population.begin_round();
+        for _ in 0..10 {
+            population.count(1.0, 0.1);
+        }
+        assert!(rate(&population) <= staying, "all objects are back");
     }
 }
