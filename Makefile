@@ -152,8 +152,10 @@ clocks: PACKAGES += libfaketime
 clocks: setup ## real cells with wrong clocks that step, as vehicle and as leader; TRIAL=NAME runs those with it in their name
 	cargo test --release --locked --test trials -- --ignored --exact clocks::all --nocapture
 
-renewal: setup ## a cell of real nodes whose certificates of three minutes are renewed twice: gaps of its maps
-	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice --nocapture
+renewal: PACKAGES += libfaketime
+renewal: setup ## cells of real nodes whose certificates are renewed twice, in six minutes and in a simulated year: missed maps
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact renewal::every_node_is_renewed_twice \
+	    renewal::year_passes_without_missed_map --nocapture --test-threads 1
 
 # For .ci/run. Both take the variables of their own targets.
 trials-and-attacks: PACKAGES += iproute2 mosquitto mosquitto-clients nftables

@@ -1,15 +1,18 @@
 //! Certificates that end soon are renewed by the node that has the CA.
 
 use std::path::Path;
+use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
 use ecod_actors::platform::clock;
+use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::gossip::FrameEvent;
 use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
 use ecod_testkit::until;
 use tempfile::TempDir;
+use tokio::time::timeout;
 
 use crate::fixture::{DAY, node as name};
 use crate::nodes::{aggregator, start, start_cell};
@@ -98,6 +101,48 @@ async fn cell_renews_certificates_at_ca() {
     }
     assert_eq!(nodes.each_ref().map(ending), [None, None, None]);
     assert_eq!(aggregator(&nodes[2]).as_deref(), Some("edge"));
+    for node in nodes {
+        node.stop().await;
+    }
+}
+
+/// Links of each node: to the brokers of the edge and of the standby.
+const LINKS: u64 = 2;
+
+/// The old certificates are still valid for months: a link doesn't wait for their end, at which all
+/// links would break together.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn renewed_links_lose_no_map() {
+    let mut machines = Machines::new();
+    let files = NODES.map(|(node, role)| machines.files(node, role, 1));
+    let nodes = start_cell(files).await;
+    let count = |event| nodes.each_ref().map(|node| node.counters().events(event));
+    until("all links are up", || {
+        count(Event::Connected).iter().all(|count| *count >= LINKS)
+    })
+    .await;
+    let before = count(Event::Connected);
+    let mut newest = nodes[2].newest_map();
+    for (node, role) in NODES {
+        machines.files(node, role, 0);
+    }
+    let mut rounds = Vec::new();
+    let all_log_in_again = async {
+        let is_over = |now: [u64; 3]| now.iter().zip(before).all(|(now, old)| *now >= old + LINKS);
+        while !is_over(count(Event::Connected)) {
+            newest.changed().await.unwrap();
+            let newest = newest.borrow_and_update();
+            let map = &newest.as_ref().unwrap().map;
+            rounds.push((map.epoch, map.round));
+        }
+    };
+    timeout(Duration::from_secs(30), all_log_in_again)
+        .await
+        .expect("all links log in by the new certificates");
+    let missed = |pair: &[(u64, u64)]| pair[1] != (pair[0].0, pair[0].1 + 1);
+    let gap = rounds.windows(2).find(|pair| missed(pair));
+    assert_eq!(gap, None, "a missed map or another term");
+    assert_eq!(count(Event::Disconnected), [0; 3]);
     for node in nodes {
         node.stop().await;
     }

@@ -39,7 +39,7 @@ pub(crate) enum MaxQos {
 }
 
 /// The sending half; it does not block.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) enum Client {
     V311(rumqttc::AsyncClient),
     V5(v5::AsyncClient),

@@ -247,17 +247,26 @@ impl LinkTask {
         }
     }
 
-    /// One connection, for as long as the broker's certificate is valid.
+    /// One connection, for as long as the broker's certificate is valid. After a renewal of either
+    /// side's certificate another connection replaces it at once, and the gateway's link stays up.
     async fn attempt(&mut self) -> Result<(), ConnectionError> {
-        let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
-            return self.session(None).await;
-        };
-        let tls = (trust.client(), trust.identity());
-        tokio::select! {
-            ended = self.session(Some(tls)) => ended,
-            error = trust.invalidated() => {
-                self.setup.counters.count(Event::Disconnected);
-                Err(ConnectionError::BrokerInvalidated(error))
+        loop {
+            let Some(trust) = self.setup.security.tls(&self.broker).map_err(Box::new)? else {
+                return self.session(None).await.map(drop);
+            };
+            let tls = (trust.client(), trust.identity());
+            let end = tokio::select! {
+                ended = self.session(Some(tls)) => ended?,
+                error = trust.invalidated() => {
+                    self.setup.counters.count(Event::Disconnected);
+                    return Err(ConnectionError::BrokerInvalidated(error));
+                }
+            };
+            match end {
+                SessionEnd::Left => return Ok(()),
+                SessionEnd::Renewed => {
+                    tracing::debug!(broker = %self.broker, "logging in with renewed certificates");
+                }
             }
         }
     }
@@ -266,7 +275,7 @@ impl LinkTask {
     async fn session(
         &mut self,
         tls: Option<(Arc<ClientConfig>, BrokerIdentity)>,
-    ) -> Result<(), ConnectionError> {
+    ) -> Result<SessionEnd, ConnectionError> {
         let setup = Arc::clone(&self.setup);
         let LinkSetup {
             client_id,
@@ -286,7 +295,11 @@ impl LinkTask {
             .await
             .inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
-        let node = identity.and_then(|identity| identity.node());
+        let node = identity.as_ref().and_then(BrokerIdentity::node);
+        let mut renewal = identity.map(|identity| {
+            let seed = setup.seed.wrapping_add(self.id.0);
+            LoginRenewal::new(client.clone(), identity, seed)
+        });
         self.packets.record();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
         counters
@@ -296,7 +309,7 @@ impl LinkTask {
             client,
             node: node.clone(),
         }) {
-            return Ok(());
+            return Ok(SessionEnd::Left);
         }
         // A working connection receives at least the answers to pings. Sent packets are not a sign
         // of life. A poll that takes longer than a keep-alive was stalled on this side.
@@ -323,6 +336,9 @@ impl LinkTask {
             }
             match packet {
                 Packet::Message { topic, payload } => {
+                    if let Some(renewal) = &mut renewal {
+                        renewal.on_message(&setup.security, &topic);
+                    }
                     let via = Via {
                         address: &self.broker,
                         node: node.as_ref(),
@@ -351,7 +367,14 @@ impl LinkTask {
                     let refused: Vec<_> = refused.into_iter().map(name).collect();
                     self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
                 }
-                Packet::Disconnected => return Ok(()),
+                Packet::Disconnected => {
+                    let is_renewed = renewal.is_some_and(|renewal| renewal.has_left);
+                    return Ok(if is_renewed {
+                        SessionEnd::Renewed
+                    } else {
+                        SessionEnd::Left
+                    });
+                }
                 // Only the return of the node's own status is decisive.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
@@ -427,6 +450,93 @@ impl Drop for LinkTask {
             .settle(self.setup.unreachable, Some(&self.broker.to_string()));
     }
 }
+
+/// The end of a session after DISCONNECT.
+enum SessionEnd {
+    /// The gateway leaves the broker.
+    Left,
+    /// A certificate of the session was renewed: another session follows.
+    Renewed,
+}
+
+/// Replaces a session before the end of its certificates. The replacement takes some milliseconds,
+/// so it begins after a round's last message, and the links of a cell do not begin together: each
+/// round still arrives, at the latest over another broker.
+///
+/// # Example
+/// The node's certificate is renewed at 0 s. `on_message` notices it within 1 s and waits for up to
+/// 5 s. The next map follows, and 1 ms later verdicts: after them the session ends by DISCONNECT.
+struct LoginRenewal {
+    client: Client,
+    identity: BrokerIdentity,
+    rng: ChaCha8Rng,
+    checked: Instant,
+    due: Option<Instant>,
+    last_round: Option<Instant>,
+    /// True after DISCONNECT was queued.
+    has_left: bool,
+}
+
+/// Time between two comparisons of a session's certificates with the present ones.
+const RENEWAL_CHECK: Duration = Duration::from_secs(1);
+
+/// Time over which the links of a cell replace their sessions.
+const RENEWAL_SPREAD: Duration = Duration::from_secs(5);
+
+/// Longest time between the map and the verdicts of one round.
+const ROUND_MESSAGES: Duration = Duration::from_millis(20);
+
+/// Time after which a session is replaced although no map is followed by verdicts.
+const PAIR_PATIENCE: Duration = Duration::from_secs(1);
+
+/// Time after which a session is replaced although no round arrives.
+const ROUND_PATIENCE: Duration = Duration::from_secs(3);
+
+impl LoginRenewal {
+    fn new(client: Client, identity: BrokerIdentity, seed: u64) -> Self {
+        Self {
+            client,
+            identity,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            checked: Instant::now(),
+            due: None,
+            last_round: None,
+            has_left: false,
+        }
+    }
+
+    /// Ends the session with this message if it is due.
+    fn on_message(&mut self, security: &Security, topic: &[u8]) {
+        let now = Instant::now();
+        if self.due.is_none() && now.duration_since(self.checked) >= RENEWAL_CHECK {
+            self.checked = now;
+            if security.has_renewed(&self.identity) {
+                let wait = RENEWAL_SPREAD.mul_f64(self.rng.random_range(0.0..=1.0));
+                self.due = Some(now + wait);
+            }
+        }
+        let is_round = ROUND_TOPICS.iter().any(|name| topic.ends_with(name));
+        let ends_pair = is_round
+            && self
+                .last_round
+                .is_some_and(|last| now.duration_since(last) < ROUND_MESSAGES);
+        if is_round {
+            self.last_round = Some(now);
+        }
+        let Some(due) = self.due.filter(|_| !self.has_left) else {
+            return;
+        };
+        let is_pause = (ends_pair && now >= due)
+            || (is_round && now >= due + PAIR_PATIENCE)
+            || now >= due + ROUND_PATIENCE;
+        if is_pause {
+            self.has_left = self.client.disconnect();
+        }
+    }
+}
+
+/// Ends of the topics of a round's messages.
+const ROUND_TOPICS: [&[u8]; 2] = [b"/global_detections", b"/global_verdicts"];
 
 /// Prefix of refused logins.
 const NOT_ADMITTED: &str = "connection refused";

@@ -16,7 +16,8 @@ use super::round_signature;
 use crate::platform::clock;
 use crate::transport::gossip::{KeyError, Member, MembershipConfig, payload_key};
 use crate::transport::pki::{
-    BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker, is_signed_by,
+    BrokerIdentity, BrokerTrust, CertificateSubject, Credentials, CredentialsError, TlsConfig,
+    external_broker, is_signed_by,
 };
 
 /// Protection of links and payloads; by default they are unprotected.
@@ -166,6 +167,23 @@ impl Security {
                  clock, such as by `timedatectl set-ntp true`, or give it a new certificate by `ecod-node pki issue`"
             )
         })
+    }
+
+    /// True if this node or the broker has a certificate that ends later than the connection's.
+    pub(crate) fn has_renewed(&self, connection: &BrokerIdentity) -> bool {
+        let own = self.credentials.as_ref().map(|own| own.current());
+        if own.is_some_and(|own| connection.ends_before(&own)) {
+            return true;
+        }
+        let (Some(members), Some(broker)) = (&self.members, connection.broker()) else {
+            return false;
+        };
+        let members = members.borrow();
+        let proven = members.iter().find(|member| member.name == *broker.name());
+        proven
+            .and_then(|member| member.certificate.as_ref())
+            .and_then(|certificate| CertificateSubject::of(certificate).ok())
+            .is_some_and(|proven| broker.expires() < proven.expires())
     }
 
     /// The payload as sent on a topic: in a signed envelope where the cell signs.

@@ -23,26 +23,35 @@ pub struct BrokerTrust {
     checked: Instant,
 }
 
-/// The node that has proven to be a broker, once the handshake is over.
+/// The certificates of both sides of one connection to a broker of the cell; the broker's once the
+/// handshake is over.
 #[derive(Debug)]
-pub struct BrokerIdentity(Option<Arc<RecordingVerifier>>);
+pub struct BrokerIdentity(Option<ProvenSides>);
+
+#[derive(Debug)]
+struct ProvenSides {
+    own: Arc<LoadedCredentials>,
+    broker: Arc<RecordingVerifier>,
+}
 
 impl BrokerIdentity {
     /// The node whose certificate the broker has; `None` for a broker outside the cell.
     pub fn node(&self) -> Option<NodeName> {
-        let chain = self
-            .0
-            .as_ref()?
-            .chain
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        Some(self.broker()?.name().clone())
+    }
+
+    /// The node and validity that the broker's certificate states.
+    pub(crate) fn broker(&self) -> Option<CertificateSubject> {
+        let recorded = &self.0.as_ref()?.broker.chain;
+        let chain = recorded.lock().unwrap_or_else(PoisonError::into_inner);
         let (certificates, _) = chain.as_ref()?;
-        Some(
-            CertificateSubject::of(certificates.first()?)
-                .ok()?
-                .name()
-                .clone(),
-        )
+        CertificateSubject::of(certificates.first()?).ok()
+    }
+
+    /// True if a certificate of this node ends later than the connection's.
+    pub(crate) fn ends_before(&self, own: &LoadedCredentials) -> bool {
+        let sides = self.0.as_ref();
+        sides.is_some_and(|sides| sides.own.identity.expires() < own.identity.expires())
     }
 }
 
@@ -102,13 +111,12 @@ impl BrokerTrust {
         Arc::clone(&self.client)
     }
 
-    /// The broker's own name, available after the handshake.
+    /// The certificates of both sides; the broker's is available after the handshake.
     pub fn identity(&self) -> BrokerIdentity {
-        BrokerIdentity(
-            self.reloaded_from
-                .as_ref()
-                .map(|_| Arc::clone(&self.recorded)),
-        )
+        BrokerIdentity(self.reloaded_from.as_ref().map(|(_, own)| ProvenSides {
+            own: Arc::clone(own),
+            broker: Arc::clone(&self.recorded),
+        }))
     }
 
     /// Waits until the broker's certificate becomes invalid; returns the reason.

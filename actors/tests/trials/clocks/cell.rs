@@ -119,13 +119,12 @@ impl Cell {
         self.path(name).join("node.pem")
     }
 
-    /// Arrival of each map at a node, by the cell's time.
-    pub(crate) fn arrivals(&self, name: &str) -> Vec<Timestamp> {
+    /// The maps that a node has accepted, dated in the cell's time.
+    pub(crate) fn maps(&self, name: &str) -> Vec<ReceivedMap> {
         let log = std::fs::read_to_string(self.path(&format!("{name}.maps"))).unwrap_or_default();
-        let maps = log
-            .lines()
-            .map_while(|line| serde_json::from_str::<ReceivedMap>(line).ok());
-        maps.map(|map| map.received_at).collect()
+        log.lines()
+            .map_while(|line| serde_json::from_str(line).ok())
+            .collect()
     }
 
     /// The log of a node.
@@ -246,6 +245,13 @@ impl Cell {
             Arc::clone(&offset),
         );
         self.feeder = Some((feeder, offset));
+    }
+
+    /// Lets the clocks of all nodes step together.
+    pub(crate) fn set_all(&self, clock: Fake) {
+        for name in self.nodes.keys() {
+            self.set_file(name, clock);
+        }
     }
 
     /// Lets a clock step.
