@@ -306,6 +306,16 @@ fn one_command_restores_expired_node() {
     let_end(&pki, "edge", Role::Edge, machines[0].path());
     let_end(&pki, "gauss", Role::Auto, machines[1].path());
 
+    let _nodes = [
+        run(Path::new(edge), &gossip),
+        run(Path::new(gauss), "127.0.0.1:0"),
+    ];
+    for machine in &machines {
+        until("the node reports the end of its certificate", || {
+            let log = fs::read_to_string(machine.path().join("log")).unwrap_or_default();
+            log.contains("give it a new certificate")
+        });
+    }
     let config_path = machines[0].path().join("node.toml");
     let config = config_path.to_str().unwrap();
     let directory = pki.to_str().unwrap();
@@ -326,10 +336,6 @@ fn one_command_restores_expired_node() {
         configuration
     );
 
-    let _nodes = [
-        run(Path::new(edge), &gossip),
-        run(Path::new(gauss), "127.0.0.1:0"),
-    ];
     until("gauss gets maps of the edge", || {
         let maps = fs::read_to_string(machines[1].path().join("maps")).unwrap_or_default();
         maps.contains("\"aggregator\":\"edge\"")
