@@ -53,11 +53,7 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     let is_public = std::fs::metadata(&files.key)
         .is_ok_and(|metadata| metadata.permissions().mode() & 0o037 != 0);
     Some(if left.is_zero() {
-        Finding::broken(
-            check,
-            "expired",
-            format!("`ecod-node pki issue {name}` creates a new one"),
-        )
+        Finding::broken(check, "expired", renewal(config, &credentials))
     } else if let Some(distrust) = current
         .verify_node(current.certificate(), UnixTime::now())
         .err()
@@ -98,14 +94,22 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
             "set `tls.revocation_list`",
         )
     } else if identity.due_for_renewal(clock::now()).is_some() {
-        Finding::doubtful(
-            check,
-            shown,
-            format!("`ecod-node pki issue {name}` creates a new one"),
-        )
+        Finding::doubtful(check, shown, renewal(config, &credentials))
     } else {
         Finding::fine(check, shown)
     })
+}
+
+/// The command that renews the node's certificate.
+fn renewal(config: &NodeConfig, credentials: &Credentials) -> String {
+    if credentials.authority().is_some() {
+        return "`ecod-node pki renew` creates a new one".into();
+    }
+    let name = credentials.current().identity.name().clone();
+    let role = config.role;
+    format!(
+        "`ecod-node join` here, with the token of `ecod-node invite --role {role} {name}` on the machine with the CA"
+    )
 }
 
 /// Checks that a vehicle that moves between cells can join each of them.

@@ -316,6 +316,14 @@ fn one_command_restores_expired_node() {
             log.contains("give it a new certificate")
         });
     }
+    for (machine, remedy) in machines.iter().zip([
+        "`ecod-node pki renew` creates a new one",
+        "`ecod-node join` here, with the token of `ecod-node invite --role auto gauss`",
+    ]) {
+        let config = machine.path().join("node.toml");
+        let advice = fails(&["doctor", "--config", config.to_str().unwrap()]);
+        assert!(advice.contains(remedy), "{advice}");
+    }
     let config_path = machines[0].path().join("node.toml");
     let config = config_path.to_str().unwrap();
     let directory = pki.to_str().unwrap();

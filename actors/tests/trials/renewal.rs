@@ -187,6 +187,11 @@ fn year_passes_without_missed_map() {
     for (node, before) in NODES.into_iter().zip(before) {
         assert_eq!(ends.renewals(node), 2, "{node}");
         assert_eq!(missed(&cell.maps(node)[before..]), 0, "{node}");
-        assert!(!cell.log(node).contains("certificate_ends"), "{node} warns");
+        // At a step a node finds its clock wrong, until it has the clocks of the others.
+        let log = cell.log(node);
+        let mut warnings = log
+            .lines()
+            .filter(|line| line.contains("certificate_ends") && !line.contains("clock is wrong"));
+        assert_eq!(warnings.next(), None, "{node} warns");
     }
 }
