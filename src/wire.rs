@@ -69,6 +69,7 @@ pub use validation::{
 use crate::model::epoch::Epoch;
 use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::{Label, LandmarkId, NodeName};
+use crate::model::origin::{PoseError, check_azimuth};
 use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
@@ -199,8 +200,13 @@ impl WirePose {
 
     /// A pose with a heading in degrees clockwise from the y axis, the north of a frame that is not
     /// rotated.
-    pub fn from_compass(x_m: f64, y_m: f64, azimuth_deg: f64) -> Self {
-        Self::new(x_m, y_m, wrap_angle((90.0 - azimuth_deg).to_radians()))
+    ///
+    /// # Errors
+    /// Returns [`PoseError::Azimuth`] for an azimuth beyond ±360°.
+    pub fn from_compass(x_m: f64, y_m: f64, azimuth_deg: f64) -> Result<Self, PoseError> {
+        check_azimuth(azimuth_deg)?;
+        let heading_rad = wrap_angle((90.0 - azimuth_deg).to_radians());
+        Ok(Self::new(x_m, y_m, heading_rad))
     }
 }
 

@@ -73,7 +73,7 @@ struct RosOptions {
     #[arg(long, value_name = "X,Y[,HEADING]", allow_hyphen_values = true, value_parser = place, group = "camera_pose")]
     pose: Option<CameraPlace>,
     /// Heading in degrees clockwise from north, in place of the third number of --pose.
-    #[arg(long, value_name = "DEG", allow_hyphen_values = true, value_parser = azimuth, requires = "pose")]
+    #[arg(long, value_name = "DEG", allow_hyphen_values = true, value_parser = degrees, requires = "pose")]
     azimuth: Option<f64>,
     /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x
     /// ahead.
@@ -191,7 +191,9 @@ impl CameraPlace {
         let Self { x_m, y_m, .. } = self;
         match (self.heading_deg, azimuth_deg) {
             (Some(heading_deg), None) => Ok(Pose::new(x_m, y_m, heading_deg.to_radians())),
-            (None, Some(azimuth_deg)) => Ok(WirePose::from_compass(x_m, y_m, azimuth_deg).into()),
+            (None, Some(azimuth_deg)) => WirePose::from_compass(x_m, y_m, azimuth_deg)
+                .map(Pose::from)
+                .map_err(|error| error.to_string()),
             _ => Err("--pose must be X,Y,HEADING, or X,Y with --azimuth DEG".to_owned()),
         }
     }
@@ -209,20 +211,21 @@ fn place(text: &str) -> Result<CameraPlace, String> {
             y_m,
             heading_deg: None,
         }),
-        Some(&[x_m, y_m, heading_deg]) => Ok(CameraPlace {
+        Some(&[x_m, y_m, heading_deg]) if heading_deg.abs() <= 360.0 => Ok(CameraPlace {
             x_m,
             y_m,
             heading_deg: Some(heading_deg),
         }),
+        Some(&[_, _, _]) => Err("the heading must be from -360 to 360".to_owned()),
         _ => Err("must be X,Y,HEADING, such as 1.5,-2,90, or X,Y with --azimuth".to_owned()),
     }
 }
 
 #[cfg(feature = "dds")]
-fn azimuth(text: &str) -> Result<f64, String> {
+fn degrees(text: &str) -> Result<f64, String> {
     finite(text)
         .ok()
-        .filter(|azimuth_deg| azimuth_deg.abs() <= 360.0)
+        .filter(|angle_deg| angle_deg.abs() <= 360.0)
         .ok_or_else(|| "must be from -360 to 360".to_owned())
 }
 

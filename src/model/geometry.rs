@@ -4,9 +4,10 @@ use std::f64::consts::{PI, TAU};
 
 use nalgebra::{Matrix2, Point2, Vector2};
 
-/// Largest heading of a pose from outside in radians, in magnitude: a full turn, with room for its
-/// rounding to 32 bits. Larger values are degrees most of the time.
-pub const HEADING_BOUND_RAD: f64 = TAU * (1.0 + 1e-6);
+/// Largest angle in radians in a message, in magnitude: a full turn, with room for its rounding to
+/// four decimals or 32 bits, and small enough for 16 bits to round down. Larger values are degrees
+/// most of the time.
+pub const TURN_BOUND_RAD: f64 = TAU * (1.0 + 2.5e-6);
 
 /// Position and heading of a vehicle's camera in the world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -96,6 +96,14 @@ pub enum PoseError {
          (`ecod-node cell set`), or state the pose in metres"
     )]
     NoOrigin,
+    /// The heading is no compass heading.
+    #[error(
+        "`azimuth_deg`: {azimuth_deg} is not allowed, must be from -360 to 360, in degrees clockwise from north"
+    )]
+    Azimuth {
+        /// The value.
+        azimuth_deg: f64,
+    },
     /// The frame is flat, and Earth is not.
     #[error(
         "the pose is {} km from the cell's origin, at most {} are allowed: check its latitude and longitude, and those of \
@@ -127,6 +135,18 @@ impl StatedPose {
             }
             Self::OnEarth(pose) => origin.ok_or(PoseError::NoOrigin)?.pose_to_map(pose),
         }
+    }
+}
+
+/// Checks a heading in degrees clockwise from north.
+///
+/// # Errors
+/// Returns [`PoseError::Azimuth`] beyond ±360°, also for NaN.
+pub fn check_azimuth(azimuth_deg: f64) -> Result<(), PoseError> {
+    if azimuth_deg.abs() <= 360.0 {
+        Ok(())
+    } else {
+        Err(PoseError::Azimuth { azimuth_deg })
     }
 }
 
@@ -184,7 +204,8 @@ impl GeographicOrigin {
     /// directions, except on one meridian.
     ///
     /// # Errors
-    /// Returns [`PoseError::TooFar`] at more than 100 km from the origin.
+    /// Returns [`PoseError::TooFar`] at more than 100 km from the origin, and
+    /// [`PoseError::Azimuth`] for a heading beyond ±360°.
     pub fn pose_to_map(&self, pose: &GeographicPose) -> Result<Pose, PoseError> {
         let GeographicPose {
             latitude_deg,
@@ -192,6 +213,7 @@ impl GeographicOrigin {
             height_m,
             azimuth_deg,
         } = *pose;
+        check_azimuth(azimuth_deg)?;
         let height_m = height_m.unwrap_or(self.height_m);
         let position = self.to_map(&GeographicPosition {
             latitude_deg,

@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
-use crate::model::geometry::{HEADING_BOUND_RAD, Pose, wrap_angle};
+use crate::model::geometry::{Pose, TURN_BOUND_RAD, wrap_angle};
 use crate::wire::WirePose;
 
 /// Focal lengths and principal point of an image, in pixels.
@@ -115,13 +115,13 @@ pub struct Mount {
 }
 
 impl Mount {
-    /// The camera's pose for a pose of the vehicle. Its heading is within [`HEADING_BOUND_RAD`], as
+    /// The camera's pose for a pose of the vehicle. Its heading is within [`TURN_BOUND_RAD`], as
     /// receivers of reports require.
     pub fn camera_pose(&self, vehicle: &Pose) -> Pose {
         let heading_rad = vehicle.heading_rad + self.pan_rad;
         Pose {
             position: vehicle.transform(self.forward_m, self.left_m),
-            heading_rad: if heading_rad.abs() > HEADING_BOUND_RAD {
+            heading_rad: if heading_rad.abs() > TURN_BOUND_RAD {
                 wrap_angle(heading_rad)
             } else {
                 heading_rad
@@ -212,7 +212,7 @@ mod tests {
         };
         for heading_rad in [-6.2, 0.5, 6.2, 700.0] {
             let camera = mount.camera_pose(&Pose::new(0.0, 0.0, heading_rad));
-            assert!(camera.heading_rad.abs() <= HEADING_BOUND_RAD);
+            assert!(camera.heading_rad.abs() <= TURN_BOUND_RAD);
             let off_rad = wrap_angle(camera.heading_rad - heading_rad - pan_rad);
             assert!(off_rad.abs() < 1e-9, "{heading_rad}");
         }

@@ -108,6 +108,26 @@ mod tests {
                 "pose.y_m: is out of bounds",
             ),
             (
+                object(r#""confidence":0.5,"x_m":1,"y_m":2,"heading_rad":90"#),
+                "objects[1].heading_rad: is beyond 2π: 90; a heading is in radians, counter-clockwise from east: is this \
+                 one in degrees?",
+            ),
+            (
+                line(
+                    "",
+                    r#","pose":{"x_m":1,"y_m":2,"heading_rad":0,"pitch_rad":-10}"#,
+                ),
+                "pose.pitch_rad: is beyond 2π: -10; an angle is in radians: is this one in degrees?",
+            ),
+            (
+                line("", r#","view":{"range_m":60,"angle_rad":62.2}"#),
+                "view.angle_rad: is beyond 2π: 62.2; an angle is in radians",
+            ),
+            (
+                line("", r#","view":{"range_m":60,"angle_rad":-1}"#),
+                "view.angle_rad: is out of bounds",
+            ),
+            (
                 line("", r#","received_at_us":"noon""#),
                 "received_at_us: invalid type: string \"noon\"",
             ),

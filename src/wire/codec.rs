@@ -191,7 +191,7 @@ mod tests {
     use proptest::{collection, option};
 
     use super::*;
-    use crate::model::geometry::HEADING_BOUND_RAD;
+    use crate::model::geometry::TURN_BOUND_RAD;
     use crate::model::time::Timestamp;
     use crate::wire::{FieldOfView, Flaw, PerceivedObject, Reputations, WirePose};
 
@@ -542,7 +542,7 @@ mod tests {
             variances in option::of((1e-6..1e6f64, 1e-6..1e6f64, -1.0..=1.0f64)),
             landmark in option::of("[a-z0-9-]{1,64}"),
             velocity_mps in option::of([-1e4..1e4f64, -1e4..1e4f64]),
-            (heading_rad, size_m) in (option::of(-10.0..10.0f64), option::of([0.0..1e5f64, 0.0..1e5f64])),
+            (heading_rad, size_m) in (option::of(-TURN_BOUND_RAD..TURN_BOUND_RAD), option::of([0.0..1e5f64, 0.0..1e5f64])),
             scores in collection::btree_map("[a-z]{1,8}".prop_map(Into::into), 0.0..=1.0f64, 0..4),
         ) -> PerceivedObject {
             PerceivedObject { covariance_m2: variances.map(|(xx, yy, correlation)| [xx, correlation * (xx * yy).sqrt(), yy]), landmark: landmark.map(Into::into), velocity_mps, heading_rad, size_m, scores, ..PerceivedObject::new(label, confidence, x_m, y_m) }
@@ -552,7 +552,7 @@ mod tests {
     prop_compose! {
         fn reports()(
             (seq, captured_at) in (any::<u64>(), any::<u64>()),
-            pose in option::of((-1e8..1e8f64, -1e8..1e8f64, -HEADING_BOUND_RAD..HEADING_BOUND_RAD)),
+            pose in option::of((-1e8..1e8f64, -1e8..1e8f64, -TURN_BOUND_RAD..TURN_BOUND_RAD)),
             objects in collection::vec(object(), 0..20),
             seen in option::of(collection::vec("[a-z]{1,8}", 0..5)),
         ) -> ObjectReport {

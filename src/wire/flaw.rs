@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::codec::read;
 use super::compact::is_compact;
 use super::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION, numbers};
+use crate::model::geometry::TURN_BOUND_RAD;
 use crate::model::names::MAX_NAME_BYTES;
 
 /// The reason why a payload was rejected, with the responsible field.
@@ -113,9 +114,14 @@ impl Flaw {
             RejectReason::InvalidLabel => {
                 format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
             }
-            RejectReason::OutOfRange if field == "pose.heading_rad" => format!(
-                "is beyond 2π{shown}; a heading is in radians, counter-clockwise from east: is this one in degrees?"
-            ),
+            RejectReason::OutOfRange if is_beyond_turn(&field, value) => {
+                let convention = if field.ends_with("heading_rad") {
+                    "a heading is in radians, counter-clockwise from east"
+                } else {
+                    "an angle is in radians"
+                };
+                format!("is beyond 2π{shown}; {convention}: is this one in degrees?")
+            }
             _ => format!("is out of bounds{shown}"),
         };
         Self::new(reason, field, fault)
@@ -130,6 +136,12 @@ impl fmt::Display for Flaw {
             (field, fault) => write!(f, "{field}: {fault}"),
         }
     }
+}
+
+/// True for an angle of more than a full turn.
+fn is_beyond_turn(field: &str, value: Option<&Value>) -> bool {
+    let number = value.and_then(Value::as_f64);
+    field.ends_with("_rad") && number.is_some_and(|number| number.abs() > TURN_BOUND_RAD)
 }
 
 /// Reads JSON.

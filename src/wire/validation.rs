@@ -14,7 +14,7 @@ use super::{
     PerceivedObject, PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION,
     Trouble, Verdict, Verdicts, WirePose,
 };
-use crate::model::geometry::{Covariance, HEADING_BOUND_RAD};
+use crate::model::geometry::{Covariance, TURN_BOUND_RAD};
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
@@ -77,9 +77,6 @@ const VARIANCE_BOUND_M2: f64 = (1u128 << 66) as f64;
 /// Largest age in seconds and largest number of pairs of detections; a power of two, which no
 /// encoding rounds up.
 const COUNT_BOUND: f64 = (1u64 << 52) as f64;
-
-/// Largest angle in radians; the headings of objects may count full turns.
-const ANGLE_BOUND_RAD: f64 = 1e6;
 
 /// Maximum yaw rate of a frame, far above any vehicle's yaw rate.
 const YAW_RATE_BOUND_RADPS: f64 = 100.0;
@@ -214,7 +211,10 @@ impl ObjectReport {
             }
         }
         self.pose.as_ref().map_or(Ok(()), check_pose)?;
-        self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
+        if let Some(FieldOfView { range_m, angle_rad }) = self.view {
+            check_between(range_m, 0.0, SIZE_BOUND_M).map_err(of("view.range_m"))?;
+            check_between(angle_rad, 0.0, TURN_BOUND_RAD).map_err(of("view.angle_rad"))?;
+        }
         let check_yaw_rate =
             |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
         self.frame_yaw_rate_radps
@@ -247,14 +247,14 @@ pub(super) fn check_pose(pose: &WirePose) -> Result<(), InvalidValue> {
     };
     check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
     check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
-    check_between(pose.heading_rad, -HEADING_BOUND_RAD, HEADING_BOUND_RAD)
+    check_between(pose.heading_rad, -TURN_BOUND_RAD, TURN_BOUND_RAD)
         .map_err(of("pose.heading_rad"))?;
     let check = |value: Option<f64>, low, high| {
         value.map_or(Ok(()), |value| check_between(value, low, high))
     };
     check(pose.height_m, 0.0, SIZE_BOUND_M).map_err(of("pose.height_m"))?;
-    check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.pitch_rad"))?;
-    check(pose.roll_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.roll_rad"))
+    check(pose.pitch_rad, -TURN_BOUND_RAD, TURN_BOUND_RAD).map_err(of("pose.pitch_rad"))?;
+    check(pose.roll_rad, -TURN_BOUND_RAD, TURN_BOUND_RAD).map_err(of("pose.roll_rad"))
 }
 
 impl PerceivedObject {
@@ -538,13 +538,8 @@ fn check_correction(correction: &PoseCorrection) -> Result<(), RejectReason> {
     let [x_m, y_m] = correction.about_m;
     check_place(x_m, y_m)?;
     check_place(correction.dx_m, correction.dy_m)?;
-    check_between(correction.dheading_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)?;
+    check_between(correction.dheading_rad, -TURN_BOUND_RAD, TURN_BOUND_RAD)?;
     check_between(correction.pairs, 0.0, COUNT_BOUND)
-}
-
-fn check_view(view: FieldOfView) -> Result<(), RejectReason> {
-    check_between(view.range_m, 0.0, SIZE_BOUND_M)?;
-    check_between(view.angle_rad, 0.0, ANGLE_BOUND_RAD)
 }
 
 fn check_motion(
@@ -555,7 +550,7 @@ fn check_motion(
     let mut speeds = velocity_mps.into_iter().flatten();
     speeds.try_for_each(|speed| check_between(speed, -SPEED_BOUND_MPS, SPEED_BOUND_MPS))?;
     heading_rad.map_or(Ok(()), |heading| {
-        check_between(heading, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)
+        check_between(heading, -TURN_BOUND_RAD, TURN_BOUND_RAD)
     })?;
     size_m
         .into_iter()

@@ -10,7 +10,7 @@ use ecod::aggregator::{Aggregator, FusionConfig};
 use ecod::diagnostics::{TroubleKind, TroubleRegister};
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::model::epoch::Epoch;
-use ecod::model::geometry::HEADING_BOUND_RAD;
+use ecod::model::geometry::TURN_BOUND_RAD;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::Landmark;
@@ -113,7 +113,7 @@ prop_compose! {
     fn votes()(
         voter in prop_oneof![Just("mallory"), Just("mallory--left"), Just("watson"), Just("zeno")],
         objects in vec(vote(), 1..12),
-        pose in option::of((number(1e8), number(1e8), -HEADING_BOUND_RAD..=HEADING_BOUND_RAD)),
+        pose in option::of((number(1e8), number(1e8), -TURN_BOUND_RAD..=TURN_BOUND_RAD)),
     ) -> ObjectReport {
         ObjectReport {
             pose: pose.map(|(x_m, y_m, heading_rad)| WirePose::new(x_m, y_m, heading_rad)),

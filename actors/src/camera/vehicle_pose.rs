@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use ecod::config::{ConfigError, check_range};
-use ecod::model::geometry::{HEADING_BOUND_RAD, Pose};
+use ecod::model::geometry::{Pose, TURN_BOUND_RAD};
 use ecod::model::origin::{GeographicPose, StatedPose};
 use ecod::model::time::Timestamp;
 use ecod::wire::use_integers;
@@ -210,7 +210,7 @@ fn in_map(fix: &Value) -> Result<StatedPose, String> {
     check_range("x_m", x_m, -WORLD_M, WORLD_M).map_err(in_words)?;
     check_range("y_m", y_m, -WORLD_M, WORLD_M).map_err(in_words)?;
     match (heading_rad, azimuth_deg) {
-        (Some(heading_rad), None) if heading_rad.abs() <= HEADING_BOUND_RAD => {
+        (Some(heading_rad), None) if heading_rad.abs() <= TURN_BOUND_RAD => {
             Ok(StatedPose::InMap(Pose::new(x_m, y_m, heading_rad)))
         }
         (Some(heading_rad), None) => Err(format!(

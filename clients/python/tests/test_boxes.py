@@ -77,6 +77,14 @@ def test_headings_in_degrees_are_refused_by_name(cell: ecod.Cell, heard: queue.Q
     ):
         with pytest.raises(ecod.Invalid, match=r"pose.heading_rad: -90.0 .* radians counter-clockwise from east.*Pose.from_compass"):
             report()
+    car = ecod.PerceivedObject("car", 0.9, 1.0, 2.0, heading_rad=90.0)
+    for place, report in (
+        (r"objects\[0\].heading_rad: 90.0 .* counter-clockwise from east", lambda: cell.report([car])),
+        ("pose.pitch_rad: 10.0 .* in radians", lambda: cell.report([], pose=ecod.Pose(1.0, 6.0, 0.0, pitch_rad=10.0))),
+        ("view.angle_rad: 62.2 .* in radians", lambda: cell.report([], pose=(1, 6, 0), view=ecod.FieldOfView(60.0, 62.2))),
+    ):
+        with pytest.raises(ecod.Invalid, match=place):
+            report()
     for azimuth_deg, heading_rad in ((0, math.pi / 2), (90, 0.0), (180, -math.pi / 2), (-90, math.pi)):
         pose = ecod.Pose.from_compass(1.0, 6.0, azimuth_deg)
         assert math.cos(pose.heading_rad - heading_rad) == pytest.approx(1.0), azimuth_deg

@@ -71,6 +71,7 @@ INVALID: list[tuple[str, Callable[[], Any]]] = [
     ("x_m", lambda: EQUATOR.to_wgs84("1", 2)),  # type: ignore[arg-type]
     ("y_m", lambda: EQUATOR.to_wgs84(1, math.nan)),
     ("azimuth_deg", lambda: EQUATOR.pose(0, 0, math.nan)),
+    ("azimuth_deg: 450", lambda: EQUATOR.pose(0, 0, 450)),
 ]
 
 

@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let number = |text: &String| text.parse::<f64>();
     let (pose, speed_mps) = match &arguments[..] {
         [x, y, flag, azimuth, speed] if flag == "--azimuth" => {
-            let pose = WirePose::from_compass(number(x)?, number(y)?, number(azimuth)?);
+            let pose = WirePose::from_compass(number(x)?, number(y)?, number(azimuth)?)?;
             (pose, number(speed)?)
         }
         [x, y, heading, speed] => {

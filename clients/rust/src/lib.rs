@@ -10,7 +10,7 @@ pub use cell::{BoxFrame, Cell, Frame, Messages, Settings, now};
 pub use ecod;
 pub use ecod::model::geometry::Pose;
 pub use ecod::model::names::{Label, LandmarkId, NodeName};
-pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
+pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition, PoseError};
 pub use ecod::model::time::Timestamp;
 pub use ecod::perception::camera::Mount;
 pub use ecod::wire::{

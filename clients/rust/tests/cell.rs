@@ -168,7 +168,7 @@ fn image(boxes: Vec<PixelBox>) -> BoxFrame {
         pan_rad: std::f64::consts::FRAC_PI_2,
         ..Mount::default()
     };
-    let vehicle = Pose::from(WirePose::from_compass(0.0, -5.0, 90.0));
+    let vehicle = Pose::from(WirePose::from_compass(0.0, -5.0, 90.0).unwrap());
     BoxFrame {
         captured_at: SystemTime::now(),
         boxes,

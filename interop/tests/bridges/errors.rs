@@ -26,6 +26,7 @@ const COMMANDS: &[&str] = &[
     "ros2-live --pose 1,2",
     "ros2-live --pose 1,2,3 --azimuth 90",
     "ros2-live --pose 1,2 --azimuth 450",
+    "ros2-live --pose 1,2,450",
     "ros2-live --pose-topic pose",
     "ros2-live --height-m 0",
     "ros2-live --pitch-deg up",

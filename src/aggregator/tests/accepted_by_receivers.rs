@@ -5,7 +5,7 @@ use proptest::option;
 use proptest::prelude::*;
 
 use super::*;
-use crate::model::geometry::HEADING_BOUND_RAD;
+use crate::model::geometry::TURN_BOUND_RAD;
 use crate::tracking::TracksConfig;
 use crate::wire::{Encoding, FieldOfView, Limits, Payload, WirePose, decode_entries, encode};
 
@@ -43,7 +43,7 @@ prop_compose! {
         (x_m, y_m, confidence) in (number(1e8), number(1e8), prop_oneof![0.0..=1.0f64, Just(0.0), Just(1.0)]),
         covariance_m2 in option::of(covariance()),
         velocity_mps in option::of([number(1e4), number(1e4)]),
-        heading_rad in option::of(number(1e6)),
+        heading_rad in option::of(-TURN_BOUND_RAD..=TURN_BOUND_RAD),
         size_m in option::of([positive(102_400.0), positive(102_400.0)]),
         landmark in option::of(Just("ball".into())),
         scores in proptest::collection::btree_map(Just("cup".into()), 0.0..=1.0f64, 0..2),
@@ -58,8 +58,8 @@ prop_compose! {
 prop_compose! {
     fn extreme_report()(
         objects in vec(object(), 1..5),
-        pose in option::of((number(1e8), number(1e8), -HEADING_BOUND_RAD..=HEADING_BOUND_RAD)),
-        view in option::of((positive(102_400.0), positive(1e6))),
+        pose in option::of((number(1e8), number(1e8), -TURN_BOUND_RAD..=TURN_BOUND_RAD)),
+        view in option::of((positive(102_400.0), 0.0..=TURN_BOUND_RAD)),
         frame_yaw_rate_radps in option::of(number(100.0)),
         moving in option::of(any::<bool>()),
     ) -> ObjectReport {

@@ -197,6 +197,8 @@ fn curvature_keeps_ground_distances() {
 #[test]
 fn heading_is_clockwise_from_local_north() {
     let origin = at(52.2, 21.0, 100.0);
+    let error = origin.pose_to_map(&pose(52.2, 21.0, 450.0)).unwrap_err();
+    assert_eq!(error, PoseError::Azimuth { azimuth_deg: 450.0 });
     for (azimuth_deg, heading_deg) in [
         (0.0, 90.0),
         (90.0, 0.0),

@@ -534,7 +534,7 @@ fn largest_numbers_survive_rounding() {
     let object = FusedObject {
         size_m: Some([SIZE_BOUND_M, SIZE_BOUND_M * (1.0 - 1e-9)]),
         velocity_mps: Some([SPEED_BOUND_MPS, -SPEED_BOUND_MPS]),
-        heading_rad: Some(ANGLE_BOUND_RAD),
+        heading_rad: Some(TURN_BOUND_RAD),
         age_s: Some(COUNT_BOUND),
         x_m: WORLD_BOUND_M,
         y_m: -WORLD_BOUND_M,
@@ -545,7 +545,7 @@ fn largest_numbers_survive_rounding() {
         about_m: [WORLD_BOUND_M, -WORLD_BOUND_M],
         dx_m: WORLD_BOUND_M,
         dy_m: -WORLD_BOUND_M,
-        dheading_rad: -ANGLE_BOUND_RAD,
+        dheading_rad: -TURN_BOUND_RAD,
         pairs: COUNT_BOUND,
     };
     let map = GlobalMap {
@@ -579,4 +579,16 @@ fn largest_numbers_survive_rounding() {
             "{encoding:?}"
         );
     }
+}
+
+#[test]
+fn azimuth_beyond_turn_is_refused() {
+    let heading_rad =
+        |azimuth_deg| WirePose::from_compass(0.0, 0.0, azimuth_deg).map(|pose| pose.heading_rad);
+    assert_eq!(heading_rad(90.0), Ok(0.0));
+    let text = heading_rad(450.0).unwrap_err().to_string();
+    assert!(
+        text.starts_with("`azimuth_deg`: 450 is not allowed"),
+        "{text}"
+    );
 }

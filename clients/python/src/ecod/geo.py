@@ -10,7 +10,7 @@ from typing import Optional
 
 from .codec import number_of
 from .errors import Invalid
-from .messages import Pose
+from .messages import Pose, check_azimuth
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -83,9 +83,10 @@ class Origin:
         """The pose in the map of one on Earth, for `Cell.report`. `azimuth_deg` is the heading, clockwise from true north.
 
         Without a height, that of the origin counts: 10 m of error move a pose that is 5 km away by 8 mm. Raises `Invalid`
-        for a place that is more than 100 km away.
+        for a place that is more than 100 km away, and for an azimuth beyond ±360°.
         """
         azimuth_deg = number_of(azimuth_deg, "azimuth_deg")
+        check_azimuth(azimuth_deg)
         height_m = self.height_m if height_m is None else height_m
         there = Origin(latitude_deg, longitude_deg, height_m)
         x, y, z = self.to_map(latitude_deg, longitude_deg, height_m)

@@ -92,11 +92,14 @@ Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
 Size = Annotated[float, _between(0, 1e5)]
 Height = Annotated[float, _between(0, 1e5), MILLIMETRES]
 Speed = Annotated[float, _between(-1e4, 1e4)]
-Angle = Annotated[float, _between(-1e6, 1e6)]
+# A full turn and its rounding to four decimals or 32 bits.
+TURN_BOUND = math.tau * (1 + 2.5e-6)
+Angle = Annotated[float, Rule(lambda value: abs(value) <= TURN_BOUND, "must be from -2π to 2π: angles are in radians")]
+OpeningAngle = Annotated[float, Rule(lambda value: 0 <= value <= TURN_BOUND, "must be from 0 to 2π: angles are in radians")]
 Heading = Annotated[
     float,
     Rule(
-        lambda value: abs(value) <= math.tau * (1 + 1e-6),
+        lambda value: abs(value) <= TURN_BOUND,
         "must be from -2π to 2π: headings are in radians counter-clockwise from east, and `Pose.from_compass` takes degrees",
     ),
 ]
@@ -110,6 +113,12 @@ Covariance = Annotated[tuple[float, float, float], Rule(_is_covariance, "must be
 def time_of(micros: int) -> datetime:
     """The time of a field whose name ends in `_us`, in UTC."""
     return datetime(1970, 1, 1, tzinfo=timezone.utc) + timedelta(microseconds=micros)
+
+
+def check_azimuth(azimuth_deg: float) -> None:
+    """Raises `Invalid` beyond ±360°."""
+    if not abs(azimuth_deg) <= 360:
+        raise Invalid(f"azimuth_deg: {azimuth_deg!r} must be from -360 to 360, degrees clockwise from north")
 
 
 @dataclass(frozen=True)
@@ -133,8 +142,7 @@ class Pose:
         It is true north unless the cell's `[origin]` rotates the map; `geo.Origin.pose` takes latitude and longitude.
         Raises `Invalid` for an azimuth beyond ±360°.
         """
-        if not abs(azimuth_deg) <= 360:
-            raise Invalid(f"azimuth_deg: {azimuth_deg!r} must be from -360 to 360, degrees clockwise from north")
+        check_azimuth(azimuth_deg)
         return cls(x_m, y_m, math.remainder(math.radians(90 - azimuth_deg), math.tau))
 
 
@@ -172,7 +180,7 @@ class FieldOfView:
     """Range and opening angle of a sensor, centred on the heading of the pose."""
 
     range_m: Size
-    angle_rad: Annotated[float, _between(0, 1e6)]
+    angle_rad: OpeningAngle
 
 
 @dataclass(frozen=True)
@@ -186,7 +194,7 @@ class PerceivedObject:
     covariance_m2: Optional[Covariance] = None
     landmark: Optional[Label] = None
     velocity_mps: Optional[tuple[Speed, Speed]] = None
-    heading_rad: Optional[Angle] = None
+    heading_rad: Optional[Heading] = None
     size_m: Optional[tuple[Size, Size]] = None
     scores: Annotated[dict[Label, Fraction], _at_most(256)] = field(default_factory=dict)
 
@@ -334,7 +342,7 @@ class FusedObject:
     contributors: list[Name]
     existence: Optional[Fraction] = None
     velocity_mps: Optional[tuple[Speed, Speed]] = None
-    heading_rad: Optional[Angle] = None
+    heading_rad: Optional[Heading] = None
     size_m: Optional[tuple[Size, Size]] = None
     age_s: Optional[Amount] = None
     first_seen_us: Optional[Count] = None
