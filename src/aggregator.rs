@@ -31,7 +31,7 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
-pub use orientation::{Misreading, MistakenHeading};
+pub use orientation::{MisreadObserver, Misreading, MistakenHeading};
 pub use report_doubt::ReportDoubt;
 
 use expelled::Expelled;
@@ -299,8 +299,11 @@ impl Aggregator {
             }
             ReportKind::VoteDetections => {
                 let vote = self.vote.as_mut().ok_or(RejectReason::NotFused)?;
-                if let Admitted::OutOfOrder(_) = window.admit(report, now)? {
+                let Admitted::InOrder(captured_at) = window.admit(report, now)? else {
                     return Err(RejectReason::OutOfOrder);
+                };
+                if self.pace.is_none() {
+                    self.orientation.observe(report, captured_at);
                 }
                 vote.observe_part(&of_vehicle(report), &report.node, now)?;
                 self.voted = true;
@@ -351,12 +354,13 @@ impl Aggregator {
         let place = ReportDoubt::of_ranges(report)
             .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation))
             .or(sender.has_moved.then_some(ReportDoubt::Moves));
-        let misread = (kind == ReportKind::Detections)
+        let is_compared = kind == ReportKind::Detections || self.pace.is_none();
+        let misread = is_compared
             .then(|| self.orientation.misreading(&report.node, now))
             .flatten();
         place
             .into_iter()
-            .chain(misread.copied().map(ReportDoubt::Misread))
+            .chain(misread.cloned().map(ReportDoubt::Misread))
             .chain(sender.is_shared.then_some(ReportDoubt::SharedName))
     }
 

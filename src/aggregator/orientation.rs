@@ -10,9 +10,14 @@
 //!
 //! Streets and rows of parked cars look alike after half a turn or a mirror, so that observers with
 //! separate views might coincide by chance. A change therefore counts only if no other change, and
-//! no shift of the same change, explains half as many objects, and if three windows agree. Two
-//! other vehicles must have reported explained objects; a sole other vehicle with objects there
-//! suffices if the change is about the observer's own position.
+//! no shift of the same change, explains half as many objects, and if three windows agree. Reports
+//! with few objects have windows of their own, three times as long, in which the objects must move
+//! in two dimensions: straight paths look alike, too.
+//!
+//! Two other vehicles must have reported explained objects, or a sole other vehicle that stands
+//! elsewhere. Against a sole vehicle, a change of the frame needs six windows and explains either
+//! of the two as well as the other. The trouble names the vehicles, because reports of one vehicle
+//! must not put the blame on another alone.
 
 mod comparison;
 mod isometry;
@@ -24,10 +29,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use comparison::{WindowComparison, WindowOutcome};
+use comparison::{ComparedReport, WindowComparison, WindowOutcome, Witnesses};
 use misreading::PlacedReport;
 
-pub use misreading::{Misreading, MistakenHeading};
+pub use misreading::{MisreadObserver, Misreading, MistakenHeading};
 
 use crate::model::names::{NodeName, vehicle_of};
 use crate::model::time::Timestamp;
@@ -47,11 +52,12 @@ const SIMULTANEOUS: Duration = Duration::from_millis(200);
 /// then, a complete window moves on with new reports.
 const JUDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Number of windows that must agree.
+/// Number of windows that must agree; for a change of the frame with a sole other vehicle.
 const MIN_WINDOWS: u32 = 3;
+const MIN_WINDOWS_OF_FRAME: u32 = 6;
 
 /// Time after which a mistake that no further window shows is over.
-const MISTAKE_MEMORY: Duration = Duration::from_secs(60);
+const MISTAKE_MEMORY: Duration = Duration::from_secs(180);
 
 /// Maximum number of observers that are compared, and the time after which a silent observer makes
 /// room.
@@ -71,14 +77,16 @@ struct ComparedObserver {
     latest: Arc<ObjectReport>,
     captured_at: Timestamp,
     compared_at: Timestamp,
-    comparison: WindowComparison,
+    /// The window of reports with many objects, and of reports with few.
+    many: WindowComparison,
+    few: WindowComparison,
     suspected: Option<SuspectedMistake>,
 }
 
 /// A mistake that windows show.
 #[derive(Debug, Clone)]
 struct SuspectedMistake {
-    misreading: Misreading,
+    found: MisreadObserver,
     windows: u32,
     shown_at: Timestamp,
 }
@@ -98,7 +106,8 @@ impl OrientationCheck {
                 latest: Arc::clone(report),
                 captured_at,
                 compared_at: captured_at,
-                comparison: WindowComparison::default(),
+                many: WindowComparison::of_many(),
+                few: WindowComparison::of_few(),
                 suspected: None,
             };
             self.observers.insert(report.node.clone(), observer);
@@ -106,10 +115,19 @@ impl OrientationCheck {
     }
 
     /// The mistake that explains the reports of an observer, if there is one.
-    pub(super) fn misreading(&self, node: &NodeName, now: Timestamp) -> Option<&Misreading> {
+    pub(super) fn misreading(&self, node: &NodeName, now: Timestamp) -> Option<&MisreadObserver> {
         let suspected = self.observers.get(node)?.suspected.as_ref()?;
+        let MisreadObserver {
+            misreading,
+            witnesses,
+        } = &suspected.found;
+        let min_windows = if misreading.is_of_frame() && witnesses.len() == 1 {
+            MIN_WINDOWS_OF_FRAME
+        } else {
+            MIN_WINDOWS
+        };
         let is_present = now.since(suspected.shown_at) < MISTAKE_MEMORY;
-        (suspected.windows >= MIN_WINDOWS && is_present).then_some(&suspected.misreading)
+        (suspected.windows >= min_windows && is_present).then_some(&suspected.found)
     }
 
     fn has_room(&mut self, now: Timestamp) -> bool {
@@ -141,21 +159,29 @@ impl OrientationCheck {
             .map(|other| (distance_m(other), other))
             .collect();
         simultaneous.sort_by(|one, other| one.0.total_cmp(&other.0));
-        let others = witnesses(simultaneous.into_iter().map(|(_, other)| other));
+        let witnesses = witnesses(simultaneous.into_iter().map(|(_, other)| other));
         let is_due = at.since(self.judged_at) >= JUDGEMENT_INTERVAL;
         let Some(observer) = self
             .observers
             .get_mut(&report.node)
-            .filter(|_| !others.is_empty())
+            .filter(|_| !witnesses.reports.is_empty())
         else {
             return;
         };
-        observer.comparison.add(&PlacedReport::of(report), &others);
-        if is_due && observer.comparison.is_complete() {
+        let Some(compared) = ComparedReport::of(&PlacedReport::of(report), &witnesses) else {
+            return;
+        };
+        let window = if compared.has_many() {
+            &mut observer.many
+        } else {
+            &mut observer.few
+        };
+        window.add(compared);
+        if is_due && window.is_complete() {
             self.judged_at = at;
-            match observer.comparison.take_outcome() {
+            match window.take_outcome() {
                 WindowOutcome::Agrees => observer.suspected = None,
-                WindowOutcome::Mistaken(misreading) => observer.suspect(misreading, at),
+                WindowOutcome::Mistaken(found) => observer.suspect(found, at),
                 WindowOutcome::Open => {}
             }
         }
@@ -163,46 +189,47 @@ impl OrientationCheck {
 }
 
 /// The first reports of the first vehicles. A vehicle is one witness, however many parts it has.
-fn witnesses<'a>(reports: impl Iterator<Item = &'a ObjectReport>) -> Vec<PlacedReport> {
-    let mut vehicles: Vec<(&str, usize)> = Vec::new();
-    let mut placed = Vec::new();
+fn witnesses<'a>(reports: impl Iterator<Item = &'a ObjectReport>) -> Witnesses {
+    let mut witnesses = Witnesses::default();
+    let mut parts = [0; MAX_OTHERS];
     for report in reports {
         let vehicle = vehicle_of(report.node.as_str());
-        let known = vehicles.iter().position(|(name, _)| *name == vehicle);
-        let number = match known {
+        let mut known = witnesses.vehicles.iter();
+        let number = match known.position(|name| name.as_str() == vehicle) {
             Some(number) => number,
-            None if vehicles.len() == MAX_OTHERS => continue,
+            None if witnesses.vehicles.len() == MAX_OTHERS => continue,
             None => {
-                vehicles.push((vehicle, 0));
-                vehicles.len() - 1
+                witnesses.vehicles.push(report.node.vehicle());
+                witnesses.vehicles.len() - 1
             }
         };
-        let parts = &mut vehicles[number].1;
-        *parts += 1;
-        if *parts <= MAX_PARTS_COMPARED {
-            placed.push(PlacedReport {
+        parts[number] += 1;
+        if parts[number] <= MAX_PARTS_COMPARED {
+            witnesses.reports.push(PlacedReport {
                 witness: 1 << number,
                 ..PlacedReport::of(report)
             });
         }
     }
-    placed
+    witnesses
 }
 
 impl ComparedObserver {
     /// Counts a window that shows a mistake; another mistake starts anew.
-    fn suspect(&mut self, misreading: Misreading, at: Timestamp) {
-        let windows = match &self.suspected {
-            Some(known)
-                if known.misreading.is_like(&misreading)
-                    && at.since(known.shown_at) < MISTAKE_MEMORY =>
-            {
-                known.windows.saturating_add(1)
-            }
-            _ => 1,
-        };
+    fn suspect(&mut self, mut found: MisreadObserver, at: Timestamp) {
+        let mut windows = 1;
+        if let Some(known) = self.suspected.take()
+            && known.found.misreading.is_like(&found.misreading)
+            && at.since(known.shown_at) < MISTAKE_MEMORY
+        {
+            windows = known.windows.saturating_add(1);
+            let room = MAX_OTHERS.saturating_sub(found.witnesses.len());
+            found
+                .witnesses
+                .extend(known.found.witnesses.into_iter().take(room));
+        }
         self.suspected = Some(SuspectedMistake {
-            misreading,
+            found,
             windows,
             shown_at: at,
         });

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use nalgebra::Point2;
 
-use super::orientation::Misreading;
+use super::orientation::MisreadObserver;
 use crate::model::geometry::Pose;
 use crate::wire::ObjectReport;
 
@@ -21,7 +21,7 @@ pub(super) const MAX_AWAY_M: f64 = 200.0;
 const MAX_SEEN_RANGE_M: f64 = 300.0;
 
 /// A doubt about the reports of a vehicle.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum ReportDoubt {
     /// An object is farther from the camera than a camera can see: positions are in another unit.
     FarObject {
@@ -35,7 +35,7 @@ pub enum ReportDoubt {
     Moves,
     /// The objects coincide with the objects of others after a turn or a mirror: a heading or a frame
     /// follows another convention.
-    Misread(Misreading),
+    Misread(MisreadObserver),
     /// Two senders report under the name: their numbers go back and forth.
     SharedName,
 }
@@ -59,7 +59,7 @@ impl fmt::Display for ReportDoubt {
             Self::FarObject { range_m } => write!(f, "an object of its report is {range_m:.0} m from its pose"),
             Self::NoObjectAtLocation => f.write_str("none of its objects is at a known location, or near one"),
             Self::Moves => f.write_str("it states `moving` = false, and its pose has moved by more than 25 m"),
-            Self::Misread(misreading) => misreading.fmt(f),
+            Self::Misread(observer) => observer.fmt(f),
             Self::SharedName => {
                 f.write_str("two programs report under this name: the numbers `seq` of its reports go back and forth")
             }

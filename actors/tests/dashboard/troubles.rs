@@ -176,8 +176,8 @@ async fn compass_heading_names_angle() {
         tokio::time::sleep(Duration::from_millis(100)).await;
         reported = of_kind().await;
     }
-    let cause = "its objects agree with the objects of others after a turn by about -90° at its position, \
-        as if its heading were clockwise from north";
+    let cause = "its objects agree with the objects of euclid after a turn by about -90° at its position, as if its \
+        heading were clockwise from north; if its pose and camera are right, check euclid";
     assert_eq!(
         reported,
         [["edge", "watson", "orientation", cause].map(str::to_owned)]

@@ -1,21 +1,29 @@
 //! The comparison of one observer with others over a window of reports.
 
+use std::collections::BTreeSet;
 use std::f64::consts::TAU;
 
-use nalgebra::{Point2, Vector2};
+use nalgebra::{Matrix2, Point2, Vector2};
 
-use super::misreading::{Misreading, PlacedReport};
+use super::misreading::{MisreadObserver, Misreading, PlacedReport};
 use crate::model::geometry::{Pose, wrap_angle};
+use crate::model::names::NodeName;
 
-/// Number of reports in a window.
-const WINDOW: usize = 10;
+/// Number of reports in a window, if they have many objects and if they have few.
+const WINDOW_OF_MANY: usize = 10;
+const WINDOW_OF_FEW: usize = 30;
 
-/// Minimum number of objects of a report that is compared, and of explained objects in most reports
-/// of a window.
-const MIN_OBJECTS: usize = 4;
+/// Number of objects from which a report has many; most reports of such a window have as many
+/// explained objects.
+const MANY_OBJECTS: usize = 4;
 
-/// Minimum number of explained objects that another vehicle must have reported to be a witness.
-const MIN_OF_WITNESS: u32 = 2;
+/// Minimum number of distinct places of the explained objects in a window of reports with few
+/// objects: the objects move.
+const MIN_PLACES: usize = 6;
+
+/// Minimum number of explained objects that another vehicle must have reported to be a witness;
+/// all of them if there are fewer.
+const MIN_OF_WITNESS: usize = 2;
 
 /// Maximum number of compared objects of a report, and of other observers' objects.
 const MAX_OBJECTS: usize = 16;
@@ -34,13 +42,17 @@ const PRESENT_GATES: f64 = 1.5;
 const AGREEING: f64 = 0.6;
 const CERTAINLY_AGREEING: f64 = 0.8;
 
-/// Minimum share of the objects that a mistake must explain.
+/// Minimum share of the objects that a mistake must explain, also where reports have few objects.
 const MIN_EXPLAINED: f64 = 0.5;
+const MIN_EXPLAINED_OF_FEW: f64 = 0.7;
 
 /// Maximum share, of the explained objects, that a rival may explain, and that coincide as reported:
 /// objects near the axis of a mirror stay in place.
 const MAX_RIVAL: f64 = 0.5;
 const MAX_UNCHANGED: f64 = 0.7;
+
+/// Ratio of explained objects above which a mistake of all explains clearly more.
+const SHARED_MARGIN: f64 = 1.1;
 
 /// Mean distance, in gates, from which another change counts as a rival.
 const RIVAL_GATES: f64 = 2.0;
@@ -49,8 +61,11 @@ const RIVAL_GATES: f64 = 2.0;
 const SHIFT_GATES: [f64; 5] = [2.0, 3.0, 4.0, 5.0, 6.0];
 
 /// Minimum root mean square distance of the explained objects of a report from their centre, in
-/// gates.
+/// gates; the same for a window of reports with few objects, and its minimum across their path:
+/// straight paths look alike.
 const MIN_SPREAD_GATES: f64 = 3.0;
+const MIN_SPREAD_OF_FEW_GATES: f64 = 2.0;
+const MIN_ACROSS_GATES: f64 = 1.0;
 
 /// Minimum distance, in gates, from the only other vehicle for a change about the own position.
 const MIN_APART_GATES: f64 = 10.0;
@@ -61,28 +76,41 @@ const MAX_HEADING_CHANGE_RAD: f64 = 0.09;
 /// Number of bins of angles.
 const BINS: usize = 180;
 
-/// Reports of an observer beside simultaneous reports of others.
-#[derive(Debug, Clone, Default)]
+/// The positions as reported.
+const NO_CHANGE: Misreading = Misreading::FrameTurn { angle_rad: 0.0 };
+
+/// Reports of an observer beside simultaneous reports of others, all with many objects or all with
+/// few.
+#[derive(Debug, Clone)]
 pub(super) struct WindowComparison {
     snapshots: Vec<ComparedReport>,
+    length: usize,
 }
 
 /// Result of a window.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) enum WindowOutcome {
     /// The objects coincide with the objects of others.
     Agrees,
     /// The objects coincide after a change.
-    Mistaken(Misreading),
+    Mistaken(MisreadObserver),
     /// Undecided, as for views that do not overlap.
     Open,
 }
 
+/// A change, and the number of objects that coincide after it.
+struct Explanation {
+    misreading: Misreading,
+    explained: usize,
+}
+
 /// One report beside the reports of others.
 #[derive(Debug, Clone)]
-struct ComparedReport {
+pub(super) struct ComparedReport {
     pose: Option<Pose>,
     objects: Vec<Point2<f64>>,
+    /// The other vehicles by the bits of [`Reference::witnesses`].
+    vehicles: Vec<NodeName>,
     /// Objects of others; empty if the report certainly agrees with them.
     references: Vec<Reference>,
     gate_m: f64,
@@ -100,12 +128,25 @@ struct Reference {
 }
 
 impl WindowComparison {
-    /// Adds a report and simultaneous reports of other vehicles, the nearest first.
-    /// Reports with too few distinct objects are not compared.
-    pub(super) fn add(&mut self, own: &PlacedReport, others: &[PlacedReport]) {
-        let Some(snapshot) = ComparedReport::of(own, others) else {
-            return;
-        };
+    /// A window of reports with many objects.
+    pub(super) fn of_many() -> Self {
+        Self::with_length(WINDOW_OF_MANY)
+    }
+
+    /// A window of reports with few objects.
+    pub(super) fn of_few() -> Self {
+        Self::with_length(WINDOW_OF_FEW)
+    }
+
+    fn with_length(length: usize) -> Self {
+        Self {
+            snapshots: Vec::new(),
+            length,
+        }
+    }
+
+    /// Adds a compared report.
+    pub(super) fn add(&mut self, snapshot: ComparedReport) {
         let turned_rad = |first: &ComparedReport| {
             let heading_rad = first.pose?.heading_rad;
             Some(wrap_angle(snapshot.pose?.heading_rad - heading_rad).abs())
@@ -121,7 +162,7 @@ impl WindowComparison {
 
     /// True if the window can be judged.
     pub(super) fn is_complete(&self) -> bool {
-        self.snapshots.len() == WINDOW
+        self.snapshots.len() == self.length
     }
 
     /// Judges the window and begins the next one.
@@ -138,24 +179,72 @@ impl WindowComparison {
             return WindowOutcome::Agrees;
         }
         let angles = AngleVotes::of(&self.snapshots);
-        let mut best: Option<(Misreading, usize)> = None;
-        for misreading in angles.peaks().chain(Misreading::without_angle()) {
-            let explained = self.explained(&misreading, None);
-            if best.is_none_or(|(_, most)| explained > most) {
-                best = Some((misreading, explained));
-            }
-        }
-        match best {
-            Some((misreading, explained))
-                if explained as f64 >= MIN_EXPLAINED * total as f64
-                    && self.unchanged() as f64 <= MAX_UNCHANGED * explained as f64
-                    && self.is_spread(&misreading)
-                    && self.is_witnessed(&misreading)
-                    && !self.has_rival(&misreading, explained, &angles) =>
+        match self.best(&angles) {
+            Some(Explanation {
+                misreading,
+                explained,
+            }) if explained as f64 >= self.min_explained() * total as f64
+                && self.unchanged() as f64 <= MAX_UNCHANGED * explained as f64
+                && self.apart_gates(&misreading, &NO_CHANGE) > RIVAL_GATES
+                && self.is_spread(&misreading)
+                && !self.has_rival(&misreading, explained, &angles) =>
             {
-                WindowOutcome::Mistaken(misreading)
+                match self.witnesses(&misreading) {
+                    Some(witnesses) => WindowOutcome::Mistaken(MisreadObserver {
+                        misreading,
+                        witnesses,
+                    }),
+                    None => WindowOutcome::Open,
+                }
             }
             _ => WindowOutcome::Open,
+        }
+    }
+
+    /// The change that explains most objects.
+    fn best(&self, angles: &AngleVotes) -> Option<Explanation> {
+        let mut best: Option<Explanation> = None;
+        for misreading in angles.peaks().chain(Misreading::without_angle()) {
+            let found = Explanation {
+                misreading,
+                explained: self.explained(&misreading, None),
+            };
+            let is_better = best
+                .as_ref()
+                .is_none_or(|known| self.is_better(&found, known));
+            if is_better {
+                best = Some(found);
+            }
+        }
+        best
+    }
+
+    /// True if the change explains more objects. A mistake of all must explain clearly more than a
+    /// mistake of the observer alone, or as many by more vehicles: where it leaves the headings of
+    /// the others as they are, both explain the same.
+    fn is_better(&self, found: &Explanation, known: &Explanation) -> bool {
+        if !found.misreading.is_shared() || known.misreading.is_shared() {
+            return found.explained > known.explained;
+        }
+        let witnesses = |it: &Explanation| {
+            let names = self.witnesses(&it.misreading);
+            names.map_or(0, |names| names.len())
+        };
+        let explained = found.explained as f64;
+        let most = known.explained as f64;
+        explained > SHARED_MARGIN * most
+            || SHARED_MARGIN * explained >= most && witnesses(found) > witnesses(known)
+    }
+
+    fn has_many(&self) -> bool {
+        self.length == WINDOW_OF_MANY
+    }
+
+    fn min_explained(&self) -> f64 {
+        if self.has_many() {
+            MIN_EXPLAINED
+        } else {
+            MIN_EXPLAINED_OF_FEW
         }
     }
 
@@ -169,27 +258,52 @@ impl WindowComparison {
 
     /// Number of objects that coincide as reported.
     fn unchanged(&self) -> usize {
-        let none = Misreading::FrameTurn { angle_rad: 0.0 };
-        self.explained(&none, None)
+        self.explained(&NO_CHANGE, None)
     }
 
-    /// True if most reports have enough explained objects that are far apart.
+    /// True if most reports have enough explained objects that are far apart, or if few objects
+    /// move in two dimensions.
     fn is_spread(&self, misreading: &Misreading) -> bool {
+        if !self.has_many() {
+            return self.moves_in_plane(misreading);
+        }
         let spread = self.snapshots.iter().filter(|snapshot| {
             let explained: Vec<_> = snapshot.coinciding(misreading, None).collect();
-            explained.len() >= MIN_OBJECTS
+            explained.len() >= MANY_OBJECTS
                 && root_mean_square_m(&explained) >= MIN_SPREAD_GATES * snapshot.gate_m
         });
         2 * spread.count() > self.snapshots.len()
     }
 
-    /// True if most reports are witnessed.
-    fn is_witnessed(&self, misreading: &Misreading) -> bool {
-        let witnessed = self
-            .snapshots
-            .iter()
-            .filter(|snapshot| snapshot.is_witnessed(misreading));
-        2 * witnessed.count() > self.snapshots.len()
+    /// True if the explained objects of the window are at enough places, not all on a line.
+    fn moves_in_plane(&self, misreading: &Misreading) -> bool {
+        let mut images = Vec::new();
+        let mut places: Vec<Point2<f64>> = Vec::new();
+        let mut gate_m: f64 = 0.0;
+        for snapshot in &self.snapshots {
+            gate_m = gate_m.max(snapshot.gate_m);
+            for image in snapshot.coinciding(misreading, None) {
+                images.push(image);
+                if !is_near(&image, &places, snapshot.gate_m) {
+                    places.push(image);
+                }
+            }
+        }
+        places.len() >= MIN_PLACES
+            && root_mean_square_m(&images) >= MIN_SPREAD_OF_FEW_GATES * gate_m
+            && across_m(&images) >= MIN_ACROSS_GATES * gate_m
+    }
+
+    /// The vehicles that witness the change, if most reports are witnessed.
+    fn witnesses(&self, misreading: &Misreading) -> Option<BTreeSet<NodeName>> {
+        let mut witnesses = BTreeSet::new();
+        let mut witnessed = 0;
+        for snapshot in &self.snapshots {
+            let vehicles = snapshot.witnesses(misreading);
+            witnessed += usize::from(!vehicles.is_empty());
+            witnesses.extend(vehicles.into_iter().cloned());
+        }
+        (2 * witnessed > self.snapshots.len()).then_some(witnesses)
     }
 
     /// True if a different change, or a shift of the same change, explains many of the objects.
@@ -223,8 +337,10 @@ impl WindowComparison {
 }
 
 impl ComparedReport {
-    /// `None` if the report has too few distinct objects.
-    fn of(own: &PlacedReport, others: &[PlacedReport]) -> Option<Self> {
+    /// Compares a report with simultaneous reports of other vehicles, the nearest first; `None`
+    /// without objects.
+    pub(super) fn of(own: &PlacedReport, witnesses: &Witnesses) -> Option<Self> {
+        let others = &witnesses.reports;
         let centre = own
             .pose
             .map_or_else(|| mean(&own.objects), |pose| pose.position);
@@ -242,9 +358,6 @@ impl ComparedReport {
                 objects.push(*object);
             }
         }
-        if objects.len() < MIN_OBJECTS {
-            return None;
-        }
         let agreeing = objects
             .iter()
             .filter(|object| {
@@ -260,24 +373,28 @@ impl ComparedReport {
         Some(Self {
             pose: own.pose,
             objects,
+            vehicles: witnesses.vehicles.clone(),
             references,
             gate_m,
             agreeing,
         })
     }
 
-    /// True if the explained objects are objects of two other vehicles. One vehicle against another
-    /// shows only that they differ: a change about a point that both share would explain the right
-    /// one, too. A change about the observer's own position needs only one other vehicle, if that
-    /// stands elsewhere and no further vehicle has objects near the explained ones or near those
-    /// that the observer reports.
-    fn is_witnessed(&self, misreading: &Misreading) -> bool {
+    /// True if the report has many objects.
+    pub(super) fn has_many(&self) -> bool {
+        self.objects.len() >= MANY_OBJECTS
+    }
+
+    /// The other vehicles that reported explained objects: two, or a sole vehicle elsewhere if no
+    /// further vehicle has objects near the explained ones or near the objects that the observer
+    /// reports. Otherwise it is empty.
+    fn witnesses(&self, misreading: &Misreading) -> Vec<&NodeName> {
         let images: Vec<_> = self.coinciding(misreading, None).collect();
         let centre = mean(&images);
-        let around_m = 2.0 * root_mean_square_m(&images);
         let present_m = PRESENT_GATES * self.gate_m;
-        let mut coinciding = [0; u32::BITS as usize];
-        let mut concerned = 0;
+        let around_m = (2.0 * root_mean_square_m(&images)).max(present_m);
+        let mut coinciding = vec![0; self.vehicles.len()];
+        let mut concerned: u32 = 0;
         let mut only: Option<Pose> = None;
         for reference in &self.references {
             let change = misreading.change_of_other(reference.observer.as_ref());
@@ -285,24 +402,32 @@ impl ComparedReport {
             let coincides =
                 position.is_some_and(|position| is_near(&position, &images, self.gate_m));
             for (number, objects) in coinciding.iter_mut().enumerate() {
-                *objects += u32::from(coincides) & reference.witnesses >> number;
+                *objects += usize::from(coincides && reference.witnesses >> number & 1 == 1);
             }
             let is_around =
                 position.is_some_and(|position| nalgebra::distance(&position, &centre) <= around_m);
-            if is_around || is_near(&reference.position, &self.objects, present_m) {
+            if coincides || is_around || is_near(&reference.position, &self.objects, present_m) {
                 concerned |= reference.witnesses;
                 only = only.or(reference.observer);
             }
         }
-        let witnesses = coinciding
+        let least = MIN_OF_WITNESS.min(images.len()).max(1);
+        let witnesses: Vec<&NodeName> = self
+            .vehicles
             .iter()
-            .filter(|objects| **objects >= MIN_OF_WITNESS)
-            .count();
+            .zip(coinciding)
+            .filter(|(_, objects)| *objects >= least)
+            .map(|(vehicle, _)| vehicle)
+            .collect();
         let stands_elsewhere = only.zip(self.pose).is_some_and(|(only, own)| {
             nalgebra::distance(&only.position, &own.position) >= MIN_APART_GATES * self.gate_m
         });
         let is_sole = concerned.count_ones() == 1 && self.references.len() < MAX_REFERENCES;
-        witnesses >= 2 || !misreading.is_of_frame() && is_sole && stands_elsewhere
+        if witnesses.len() >= 2 || is_sole && stands_elsewhere {
+            witnesses
+        } else {
+            Vec::new()
+        }
     }
 
     /// Images of the objects that coincide after the change and a shift in gates.
@@ -328,6 +453,14 @@ impl ComparedReport {
             .filter_map(move |object| Some(change?.apply(object)));
         images.filter(move |image| is_near(image, &references, self.gate_m))
     }
+}
+
+/// Simultaneous reports of other vehicles.
+#[derive(Debug, Default)]
+pub(super) struct Witnesses {
+    /// The vehicles by the bits of [`PlacedReport::witness`].
+    pub(super) vehicles: Vec<NodeName>,
+    pub(super) reports: Vec<PlacedReport>,
 }
 
 /// Distinct objects of other vehicles.
@@ -382,6 +515,21 @@ fn root_mean_square_m(points: &[Point2<f64>]) -> f64 {
         .map(|point| (point - centre).norm_squared())
         .sum();
     (sum / points.len().max(1) as f64).sqrt()
+}
+
+/// Root mean square distance from the line that fits the points best.
+fn across_m(points: &[Point2<f64>]) -> f64 {
+    let centre = mean(points);
+    let sum: Matrix2<f64> = points
+        .iter()
+        .map(|point| {
+            let offset = point - centre;
+            offset * offset.transpose()
+        })
+        .sum();
+    let spread_m2 = sum / points.len().max(1) as f64;
+    let eigenvalues = spread_m2.symmetric_eigenvalues();
+    eigenvalues.min().max(0.0).sqrt()
 }
 
 /// Hough transform: by angle of a turn or a mirror, the number of objects that it moves to an object

@@ -1,5 +1,6 @@
 //! Mistakes of conventions: how they change positions, and their words.
 
+use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::fmt;
 
@@ -7,6 +8,7 @@ use nalgebra::Point2;
 
 use super::isometry::Isometry;
 use crate::model::geometry::{Pose, wrap_angle};
+use crate::model::names::NodeName;
 use crate::wire::ObjectReport;
 
 /// A change of an observer's positions after which its objects coincide with the objects of others.
@@ -38,6 +40,17 @@ pub enum Misreading {
     },
     /// A mistaken heading of this observer and of others.
     Shared(MistakenHeading),
+}
+
+/// A change that explains the objects of an observer, and the vehicles whose objects show it.
+///
+/// A sole vehicle shows only that it and the observer differ: the text then names both.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MisreadObserver {
+    /// The change.
+    pub misreading: Misreading,
+    /// The vehicles.
+    pub witnesses: BTreeSet<NodeName>,
 }
 
 /// A mistake that explains the heading which an observer states.
@@ -113,7 +126,7 @@ impl MistakenHeading {
             .find(|mistake| is_same(mistake.turn_rad(heading_rad), angle_rad))
     }
 
-    /// Text after “its objects agree with the objects of others”, for a mistake of all.
+    /// Text after “its objects agree with the objects of euclid”, for a mistake of all.
     fn of_all_in_words(self) -> &'static str {
         match self {
             Self::Compass => "as if all headings were clockwise from north",
@@ -171,6 +184,11 @@ impl Misreading {
     /// True for changes about the origin of the cell, which all observers share.
     pub(super) fn is_of_frame(&self) -> bool {
         matches!(self, Self::FrameTurn { .. } | Self::FrameMirror { .. })
+    }
+
+    /// True for a mistake of this observer and of others.
+    pub(super) fn is_shared(&self) -> bool {
+        matches!(self, Self::Shared(_))
     }
 
     /// True if two windows show the same mistake, of a vehicle whose heading may have changed.
@@ -234,9 +252,36 @@ fn axes_in_words(angle_rad: f64) -> Option<&'static str> {
     found.map(|(_, words)| *words)
 }
 
+impl fmt::Display for MisreadObserver {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut names = self.witnesses.iter();
+        let first = names.next().map_or("others", NodeName::as_str);
+        write!(f, "its objects agree with the objects of {first}")?;
+        let second = names.next();
+        match (second, names.next()) {
+            (Some(second), None) => write!(f, " and {second}")?,
+            (Some(second), Some(_)) => write!(f, ", {second} and others")?,
+            (None, _) => {}
+        }
+        write!(f, " {}", self.misreading)?;
+        if second.is_some() {
+            return Ok(());
+        }
+        match self.misreading {
+            Misreading::Turn { .. } | Misreading::Mirror { .. } => {
+                write!(f, "; if its pose and camera are right, check {first}")
+            }
+            Misreading::FrameTurn { .. } | Misreading::FrameMirror { .. } => {
+                write!(f, "; if its axes are right, check {first}")
+            }
+            Misreading::Shared(_) => Ok(()),
+        }
+    }
+}
+
+/// Text after “its objects agree with the objects of euclid”.
 impl fmt::Display for Misreading {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("its objects agree with the objects of others ")?;
         match *self {
             Self::Turn {
                 angle_rad,
