@@ -18,6 +18,7 @@ use nalgebra::Vector2;
 use super::attributes::StatedAttributes;
 use super::fading_mean::FadingMean;
 use super::handles::SensorId;
+use super::population::LeavingRates;
 use crate::model::time::Timestamp;
 
 /// Time constant in seconds with which confidences, and a vehicle's evidence about another vehicle's object, fade.
@@ -37,9 +38,6 @@ const MAX_PEER_NATS: f64 = 2.5;
 
 /// Minimum log-odds of a confirmed track at a new detection, because the detection continues this track.
 const LATENT_NATS: f64 = -3.0;
-
-/// Additional rate per second at which an undetected object leaves.
-const UNSEEN_HZ: f64 = 0.15;
 
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
@@ -162,19 +160,23 @@ impl Existence {
         }
     }
 
-    /// Predicts to `at`: objects leave at this rate per second, and at a greater rate if no vehicle detects them.
-    pub(super) fn predict(&mut self, at: Timestamp, leaving_hz: f64, is_detected: bool) {
+    /// Predicts to `at`: objects leave, at a greater rate if no vehicle detects them.
+    pub(super) fn predict(&mut self, at: Timestamp, leaving: LeavingRates, is_detected: bool) {
         if at <= self.at {
             return;
         }
-        self.log_odds = self.log_odds_at(at, leaving_hz, is_detected);
+        self.log_odds = self.log_odds_at(at, leaving, is_detected);
         self.at = self.at.max(at);
     }
 
     /// The log-odds at `at` without further observations.
-    pub(super) fn log_odds_at(&self, at: Timestamp, leaving_hz: f64, is_detected: bool) -> f64 {
-        let rate_hz = leaving_hz + if is_detected { 0.0 } else { UNSEEN_HZ };
-        let stays = (-rate_hz * at.since(self.at).as_secs_f64()).exp();
+    pub(super) fn log_odds_at(
+        &self,
+        at: Timestamp,
+        leaving: LeavingRates,
+        is_detected: bool,
+    ) -> f64 {
+        let stays = (-leaving.of(is_detected) * at.since(self.at).as_secs_f64()).exp();
         let present = logistic(self.log_odds) * stays;
         (present / (1.0 - present)).ln().max(-2.0 * MAX_NATS)
     }

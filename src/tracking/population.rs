@@ -28,6 +28,32 @@ impl Births {
     }
 }
 
+/// Rates at which objects leave, per second.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LeavingRates {
+    detected_hz: f64,
+    undetected_hz: f64,
+}
+
+impl LeavingRates {
+    /// Objects leave at `leaving_hz`; undetected ones also leave after a mean time of `life_s` seconds.
+    pub(super) fn new(leaving_hz: f64, life_s: f64) -> Self {
+        Self {
+            detected_hz: leaving_hz,
+            undetected_hz: leaving_hz + 1.0 / life_s,
+        }
+    }
+
+    /// The rate of an object that a vehicle detects, or that all vehicles miss.
+    pub(super) fn of(&self, is_detected: bool) -> f64 {
+        if is_detected {
+            self.detected_hz
+        } else {
+            self.undetected_hz
+        }
+    }
+}
+
 /// The time for which the objects stay whose tracks one vehicle began.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Population {

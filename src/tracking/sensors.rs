@@ -12,7 +12,7 @@ use super::coverage::Coverage;
 use super::existence::{DetectionRates, ObservationRates, ObservationState};
 use super::fading_mean::FadingMean;
 use super::handles::SensorId;
-use super::population::{Births, Population};
+use super::population::{Births, LeavingRates, Population};
 use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::names::NodeName;
@@ -156,9 +156,10 @@ impl Sensors {
         }
     }
 
-    /// Rate at which objects leave, per second.
-    pub(super) fn leaving_hz(&self) -> f64 {
-        Population::leaving_hz(self.iter().map(|sensor| &sensor.population))
+    /// Rates at which objects leave; undetected ones also leave after a mean time of `life_s` seconds.
+    pub(super) fn leaving(&self, life_s: f64) -> LeavingRates {
+        let leaving_hz = Population::leaving_hz(self.iter().map(|sensor| &sensor.population));
+        LeavingRates::new(leaving_hz, life_s)
     }
 
     /// Sets the pose biases of all vehicles to zero.

@@ -14,6 +14,7 @@ use super::existence::{Existence, SensorHistory, logistic};
 use super::grid::IndexedTrack;
 use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
+use super::population::LeavingRates;
 use super::twins::Twins;
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName};
@@ -239,9 +240,9 @@ impl Track {
         self.hits >= CONFIRMED_HITS
     }
 
-    /// Predicts the existence to `at`; `leaving_hz` is the rate at which objects leave.
-    pub(super) fn predict_existence(&mut self, at: Timestamp, leaving_hz: f64) {
-        self.existence.predict(at, leaving_hz, self.is_detected);
+    /// Predicts the existence to `at`.
+    pub(super) fn predict_existence(&mut self, at: Timestamp, leaving: LeavingRates) {
+        self.existence.predict(at, leaving, self.is_detected);
     }
 
     /// Records whether any vehicle detects the object at `at`.
@@ -257,11 +258,11 @@ impl Track {
     pub(super) fn existence_at(
         &self,
         at: Timestamp,
-        leaving_hz: f64,
+        leaving: LeavingRates,
         trust: impl Fn(SensorId) -> f64,
     ) -> f64 {
         let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
-        let observations = self.existence.log_odds_at(at, leaving_hz, is_detected);
+        let observations = self.existence.log_odds_at(at, leaving, is_detected);
         let mut confidences = 0.0;
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);

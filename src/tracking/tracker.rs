@@ -247,7 +247,7 @@ impl Tracker {
         let mut evidence = Vec::new();
         self.tracks
             .reindex(reports.first().map_or(now, |report| report.at));
-        let leaving_hz = self.sensors.leaving_hz();
+        let leaving = self.sensors.leaving(self.config.life_s);
         for instant in reports.chunk_by(|a, b| a.at == b.at && a.report.node != b.report.node) {
             let at = instant[0].at;
             self.tracks.reindex_if_stale(at);
@@ -256,7 +256,7 @@ impl Tracker {
                 tracks: &mut self.tracks,
                 sensors: &mut self.sensors,
                 neighbours: &mut self.neighbours,
-                leaving_hz,
+                leaving,
                 at,
             };
             let reports = instant
@@ -282,7 +282,7 @@ impl Tracker {
     fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
         let fleet = &self.sensors.fleet;
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
-        let leaving_hz = self.sensors.leaving_hz();
+        let leaving = self.sensors.leaving(self.config.life_s);
         let mut published = Vec::with_capacity(self.tracks.len());
         let seen_since = now - Duration::from_secs_f64(self.config.life_s);
         for track in self
@@ -290,7 +290,7 @@ impl Tracker {
             .iter()
             .filter(|track| track.last_seen >= seen_since)
         {
-            let existence = track.existence_at(now, leaving_hz, |id| fleet.trust(id));
+            let existence = track.existence_at(now, leaving, |id| fleet.trust(id));
             let object = track.object(now, &self.config, existence, name);
             if object.confidence >= self.config.min_confidence {
                 published.push(object);

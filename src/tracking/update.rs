@@ -16,6 +16,7 @@ use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement, VELOCITY_SIGMA_MPS};
 use super::lifecycle::track_id;
 use super::neighbour_tracks::NeighbourTracks;
+use super::population::LeavingRates;
 use super::registration::{RegistrationFrame, RegistrationSample};
 use super::scan::{Scan, ScannedDetection};
 use super::sensors::{Residual, Sensors};
@@ -73,8 +74,7 @@ pub(super) struct InstantUpdate<'a> {
     pub(super) tracks: &'a mut TrackStore,
     pub(super) sensors: &'a mut Sensors,
     pub(super) neighbours: &'a mut NeighbourTracks,
-    /// Rate at which objects leave, per second.
-    pub(super) leaving_hz: f64,
+    pub(super) leaving: LeavingRates,
     pub(super) at: Timestamp,
 }
 
@@ -171,7 +171,7 @@ impl InstantUpdate<'_> {
             track.history.clear();
         }
         track.record_hit(at);
-        track.predict_existence(at, self.leaving_hz);
+        track.predict_existence(at, self.leaving);
         track.existence.raise(OWN_NATS);
         if let Some(history) = track.history.for_hit(vehicle, at) {
             history.hit(at, measurement.position, OWN_NATS, OWN_NATS);
@@ -393,7 +393,7 @@ impl InstantUpdate<'_> {
         for (number, observation) in observations.iter().enumerate() {
             let scan = &scans[observation.scan];
             let track = &mut self.tracks[observation.track];
-            track.predict_existence(at, self.leaving_hz);
+            track.predict_existence(at, self.leaving);
             let nats = observation.nats;
             if observation.detection.is_some() && scan.is_trusted() && track.is_confirmed() {
                 track.existence.revive();
