@@ -112,7 +112,7 @@ fn extreme_detection() -> impl Strategy<Value = PerceivedObject> {
         (up_to(1e8), up_to(1e8), 0.0..=1.0),
         proptest::option::of(up_to(7e19).prop_map(f64::abs)),
         proptest::option::of([up_to(1e4), up_to(1e4)]),
-        proptest::option::of(up_to(1e6)),
+        proptest::option::of(-TAU..=TAU),
         proptest::option::of([
             up_to(102_400.0).prop_map(f64::abs),
             up_to(102_400.0).prop_map(f64::abs),
