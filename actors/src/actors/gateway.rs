@@ -480,7 +480,7 @@ impl GatewayState {
 
     /// Handles an event of a link's task; an event of a closed link is ignored. A new connection
     /// publishes the status and subscribes before it counts as up. The node's other parts get the
-    /// link's new state if it has changed.
+    /// link's new state if it has changed, and after each login: retained messages follow anew.
     ///
     /// # Example
     /// The broker of `edge` ends. `Lost(Down)` arrives: the link has no client and its state is
@@ -497,6 +497,7 @@ impl GatewayState {
         let Some(link) = self.links.get_mut(&id) else {
             return;
         };
+        let is_login = matches!(change, LinkChange::Accepted { .. });
         let state = match change {
             LinkChange::Accepted { client, node } => {
                 // The queue of a new connection is empty, so that both fit.
@@ -539,7 +540,7 @@ impl GatewayState {
                 state
             }
         };
-        if link.state != state {
+        if link.state != state || is_login {
             link.state = state;
             publish_state(&self.inbox, link);
         }

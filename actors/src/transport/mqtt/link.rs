@@ -1,5 +1,6 @@
 //! A link to one broker: its task connects, reads packets, and reconnects.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -82,6 +83,8 @@ pub(crate) struct Link {
     /// The node whose certificate the broker has proven in the last handshake.
     pub(crate) node: Option<NodeName>,
     packets: Arc<PacketCounter>,
+    /// True once the gateway leaves the broker.
+    is_leaving: Arc<AtomicBool>,
     echo: EchoMonitor,
     task: Option<JoinHandle<()>>,
     abort: AbortHandle,
@@ -105,11 +108,13 @@ impl Link {
             setup,
             report,
             packets,
+            is_leaving: Arc::default(),
             reported_refusal: None,
             has_reported_oversized: false,
             has_reported_clock: false,
         };
         let packets = Arc::clone(&task.packets);
+        let is_leaving = Arc::clone(&task.is_leaving);
         let task = tokio::spawn(task.run(backoff));
         let abort = task.abort_handle();
         let echo = EchoMonitor::default();
@@ -119,6 +124,7 @@ impl Link {
             client: None,
             node: None,
             packets,
+            is_leaving,
             echo,
             abort,
             task: Some(task),
@@ -144,6 +150,7 @@ impl Link {
 
     /// Sends the queued messages and DISCONNECT, so that there is no last will, within `patience`.
     pub(crate) async fn leave(mut self, patience: Duration) {
+        self.is_leaving.store(true, Ordering::Relaxed);
         let is_sent = self.client.as_ref().is_some_and(Client::disconnect);
         if is_sent
             && let Some(task) = self.task.take()
@@ -178,6 +185,7 @@ struct LinkTask {
     setup: Arc<LinkSetup>,
     report: LinkSink,
     packets: Arc<PacketCounter>,
+    is_leaving: Arc<AtomicBool>,
     /// The refusal that was logged last.
     reported_refusal: Option<String>,
     has_reported_oversized: bool,
@@ -264,6 +272,7 @@ impl LinkTask {
             };
             match end {
                 SessionEnd::Left => return Ok(()),
+                SessionEnd::Renewed if self.is_leaving.load(Ordering::Relaxed) => return Ok(()),
                 SessionEnd::Renewed => {
                     tracing::debug!(broker = %self.broker, "logging in with renewed certificates");
                 }
@@ -300,6 +309,8 @@ impl LinkTask {
             let seed = setup.seed.wrapping_add(self.id.0);
             LoginRenewal::new(client.clone(), identity, seed)
         });
+        // A broker that still has its former certificate would end in an endless row of logins.
+        renewal.take_if(|renewal| setup.security.has_renewed(&renewal.identity));
         self.packets.record();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
         counters
@@ -334,11 +345,15 @@ impl LinkTask {
             if self.packets.record() {
                 self.report_change(LinkChange::Answered);
             }
+            if let Some(renewal) = &mut renewal {
+                let topic = match &packet {
+                    Packet::Message { topic, .. } => &**topic,
+                    _ => &[],
+                };
+                renewal.on_packet(&setup.security, topic);
+            }
             match packet {
                 Packet::Message { topic, payload } => {
-                    if let Some(renewal) = &mut renewal {
-                        renewal.on_message(&setup.security, &topic);
-                    }
                     let via = Via {
                         address: &self.broker,
                         node: node.as_ref(),
@@ -464,7 +479,7 @@ enum SessionEnd {
 /// round still arrives, at the latest over another broker.
 ///
 /// # Example
-/// The node's certificate is renewed at 0 s. `on_message` notices it within 1 s and waits for up to
+/// The node's certificate is renewed at 0 s. `on_packet` notices it within 1 s and waits for up to
 /// 5 s. The next map follows, and 1 ms later verdicts: after them the session ends by DISCONNECT.
 struct LoginRenewal {
     client: Client,
@@ -505,8 +520,8 @@ impl LoginRenewal {
         }
     }
 
-    /// Ends the session with this message if it is due.
-    fn on_message(&mut self, security: &Security, topic: &[u8]) {
+    /// Ends the session after this packet, of a topic or of none, if it is due.
+    fn on_packet(&mut self, security: &Security, topic: &[u8]) {
         let now = Instant::now();
         if self.due.is_none() && now.duration_since(self.checked) >= RENEWAL_CHECK {
             self.checked = now;
