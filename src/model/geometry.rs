@@ -5,9 +5,9 @@ use std::f64::consts::{PI, TAU};
 use nalgebra::{Matrix2, Point2, Vector2};
 
 /// Largest angle in radians in a message, in magnitude: a full turn, with room for its rounding to
-/// four decimals or 32 bits, and small enough for 16 bits to round down. Larger values are degrees
-/// most of the time.
-pub const TURN_BOUND_RAD: f64 = TAU * (1.0 + 2.5e-6);
+/// four decimals or 32 bits. It is exact in 32 bits, and 16 bits round it down, so that angles
+/// within it remain within it in every encoding. Larger values are degrees most of the time.
+pub const TURN_BOUND_RAD: f64 = 13_176_827.0 / 2_097_152.0;
 
 /// Position and heading of a vehicle's camera in the world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]

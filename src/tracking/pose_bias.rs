@@ -275,7 +275,7 @@ impl PoseBias {
             about_m: [self.pivot.x, self.pivot.y],
             dx_m: self.error.x,
             dy_m: self.error.y,
-            dheading_rad: self.error.z,
+            dheading_rad: wrap_angle(self.error.z),
             pairs: self.pairs,
         })
     }

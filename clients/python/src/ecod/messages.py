@@ -92,8 +92,8 @@ Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
 Size = Annotated[float, _between(0, 1e5)]
 Height = Annotated[float, _between(0, 1e5), MILLIMETRES]
 Speed = Annotated[float, _between(-1e4, 1e4)]
-# A full turn and its rounding to four decimals or 32 bits.
-TURN_BOUND = math.tau * (1 + 2.5e-6)
+# A full turn, with room for its rounding to four decimals or 32 bits; exact in 32 bits.
+TURN_BOUND = 13_176_827 / 2_097_152
 Angle = Annotated[float, Rule(lambda value: abs(value) <= TURN_BOUND, "must be from -2π to 2π: angles are in radians")]
 OpeningAngle = Annotated[float, Rule(lambda value: 0 <= value <= TURN_BOUND, "must be from 0 to 2π: angles are in radians")]
 Heading = Annotated[
