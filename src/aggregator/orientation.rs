@@ -215,18 +215,18 @@ fn witnesses<'a>(reports: impl Iterator<Item = &'a ObjectReport>) -> Witnesses {
 }
 
 impl ComparedObserver {
-    /// Counts a window that shows a mistake; another mistake starts anew.
+    /// Counts a window that shows a mistake; another mistake starts anew, and so do other
+    /// witnesses. Those of all windows remain.
     fn suspect(&mut self, mut found: MisreadObserver, at: Timestamp) {
         let mut windows = 1;
         if let Some(known) = self.suspected.take()
             && known.found.misreading.is_like(&found.misreading)
             && at.since(known.shown_at) < MISTAKE_MEMORY
+            && !known.found.witnesses.is_disjoint(&found.witnesses)
         {
             windows = known.windows.saturating_add(1);
-            let room = MAX_OTHERS.saturating_sub(found.witnesses.len());
-            found
-                .witnesses
-                .extend(known.found.witnesses.into_iter().take(room));
+            let earlier = &known.found.witnesses;
+            found.witnesses.retain(|vehicle| earlier.contains(vehicle));
         }
         self.suspected = Some(SuspectedMistake {
             found,

@@ -1,6 +1,6 @@
 //! The comparison of one observer with others over a window of reports.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::TAU;
 
 use nalgebra::{Matrix2, Point2, Vector2};
@@ -294,16 +294,24 @@ impl WindowComparison {
             && across_m(&images) >= MIN_ACROSS_GATES * gate_m
     }
 
-    /// The vehicles that witness the change, if most reports are witnessed.
+    /// The vehicles that witness the change in most of the witnessed reports, if most reports are
+    /// witnessed. A vehicle whose objects coincide in a few reports does so by chance.
     fn witnesses(&self, misreading: &Misreading) -> Option<BTreeSet<NodeName>> {
-        let mut witnesses = BTreeSet::new();
+        let mut reports: BTreeMap<NodeName, usize> = BTreeMap::new();
         let mut witnessed = 0;
         for snapshot in &self.snapshots {
             let vehicles = snapshot.witnesses(misreading);
             witnessed += usize::from(!vehicles.is_empty());
-            witnesses.extend(vehicles.into_iter().cloned());
+            for vehicle in vehicles {
+                *reports.entry(vehicle.clone()).or_default() += 1;
+            }
         }
-        (2 * witnessed > self.snapshots.len()).then_some(witnesses)
+        let witnesses: BTreeSet<NodeName> = reports
+            .into_iter()
+            .filter(|(_, reports)| 2 * reports > witnessed)
+            .map(|(vehicle, _)| vehicle)
+            .collect();
+        (2 * witnessed > self.snapshots.len() && !witnesses.is_empty()).then_some(witnesses)
     }
 
     /// True if a different change, or a shift of the same change, explains many of the objects.
