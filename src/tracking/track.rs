@@ -253,6 +253,17 @@ impl Track {
             .any(|history| history.state.is_hit() && at <= history.observed_at + DETECTED_WITHIN);
     }
 
+    /// Log-odds that the object is there at `at`, from observations alone.
+    fn observed_log_odds_at(&self, at: Timestamp, leaving: LeavingRates) -> f64 {
+        let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
+        self.existence.log_odds_at(at, leaving, is_detected)
+    }
+
+    /// Probability that the object is there at `at`, from observations alone.
+    pub(super) fn presence_at(&self, at: Timestamp, leaving: LeavingRates) -> f64 {
+        logistic(self.observed_log_odds_at(at, leaving))
+    }
+
     /// Probability that the object is there at `at`, from observations and confidences; `trust` returns the trust in a
     /// vehicle, 0 to 1.
     pub(super) fn existence_at(
@@ -261,8 +272,7 @@ impl Track {
         leaving: LeavingRates,
         trust: impl Fn(SensorId) -> f64,
     ) -> f64 {
-        let is_detected = self.is_detected && at.since(self.last_seen) <= DETECTED_WITHIN;
-        let observations = self.existence.log_odds_at(at, leaving, is_detected);
+        let observations = self.observed_log_odds_at(at, leaving);
         let mut confidences = 0.0;
         for history in self.history.iter() {
             confidences += trust(history.sensor) * history.shared_confidence_nats(at);

@@ -189,13 +189,14 @@ impl Tracker {
             .since(self.closed_at)
             .as_secs_f64()
             .min(self.config.life_s);
+        let leaving = self.sensors.leaving(self.config.life_s);
         for sensor in self.sensors.iter_mut() {
             sensor.population.begin_round();
         }
         for track in self.tracks.iter().filter(|track| track.is_settled) {
             let spawner = track.spawned_by.and_then(|id| self.sensors.get_mut(id));
             if let Some(sensor) = spawner {
-                let present = track.existence.probability();
+                let present = track.presence_at(now, leaving);
                 sensor.population.count(present, passed_s);
             }
         }
