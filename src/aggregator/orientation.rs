@@ -216,7 +216,7 @@ fn witnesses<'a>(reports: impl Iterator<Item = &'a ObjectReport>) -> Witnesses {
 
 impl ComparedObserver {
     /// Counts a window that shows a mistake; another mistake starts anew, and so do other
-    /// witnesses. Those of all windows remain.
+    /// witnesses. Only witnesses of all windows remain.
     fn suspect(&mut self, mut found: MisreadObserver, at: Timestamp) {
         let mut windows = 1;
         if let Some(known) = self.suspected.take()

@@ -520,7 +520,7 @@ impl LoginRenewal {
         }
     }
 
-    /// Ends the session after this packet, of a topic or of none, if it is due.
+    /// Ends the session after this packet, whose topic may be empty, if it is due.
     fn on_packet(&mut self, security: &Security, topic: &[u8]) {
         let now = Instant::now();
         if self.due.is_none() && now.duration_since(self.checked) >= RENEWAL_CHECK {
