@@ -195,7 +195,7 @@ mod tests {
             (x_m, y_m, confidence) in (up_to(1e8), up_to(1e8), 0.0..=1.0),
             variance in option::of(up_to(7e19).prop_map(f64::abs)),
             velocity_mps in option::of([up_to(1e4), up_to(1e4)]),
-            heading_rad in option::of(up_to(1e6)),
+            heading_rad in option::of(-TAU..=TAU),
             size_m in option::of([up_to(102_400.0).prop_map(f64::abs), up_to(102_400.0).prop_map(f64::abs)]),
             label in prop_oneof![Just("car".to_owned()), "\\PC{1,16}".prop_filter("a label", |text| is_label(text))],
             score in 0.0..=1.0,
