@@ -60,11 +60,13 @@ const RIVAL_GATES: f64 = 2.0;
 /// Distances of shifts, in gates: up to the spacing of queued cars.
 const SHIFT_GATES: [f64; 5] = [2.0, 3.0, 4.0, 5.0, 6.0];
 
-/// Minimum root mean square distance of the explained objects of a report from their centre, in
-/// gates; the same for a window of reports with few objects, and its minimum across their path:
-/// straight paths look alike.
+/// Minimum root mean square distance of explained objects from their centre, in gates: in a report
+/// with many objects, and in a whole window of reports with few.
 const MIN_SPREAD_GATES: f64 = 3.0;
 const MIN_SPREAD_OF_FEW_GATES: f64 = 2.0;
+
+/// Minimum root mean square distance of few moving objects from the line of their path, in gates:
+/// all straight paths look alike.
 const MIN_ACROSS_GATES: f64 = 1.0;
 
 /// Minimum distance, in gates, from the only other vehicle for a change about the own position.
@@ -295,7 +297,7 @@ impl WindowComparison {
     }
 
     /// The vehicles that witness the change in most of the witnessed reports, if most reports are
-    /// witnessed. A vehicle whose objects coincide in a few reports does so by chance.
+    /// witnessed. In a few reports, objects of a vehicle coincide by chance.
     fn witnesses(&self, misreading: &Misreading) -> Option<BTreeSet<NodeName>> {
         let mut reports: BTreeMap<NodeName, usize> = BTreeMap::new();
         let mut witnessed = 0;
